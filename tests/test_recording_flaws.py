@@ -528,3 +528,15 @@ def test_counts_of_an_encoder_are_no_steps_of_the_drive() -> None:
     drive, told = drive_from_displacement(t, np.round(np.interp(t, [0, 300, 600], [0, 30, 120])), "stage")
     assert drive.velocities == pytest.approx([0.1, 0.3], rel=1e-3)
     assert "times their noise" not in told[-1].what
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_any_column_has_a_drive(seed: int) -> None:
+    """Knots stay apart while they are moved: velocities are finite, whatever the counts and bursts."""
+    rng = np.random.default_rng(seed)
+    lasts, V = rng.uniform(0.3, 4.0, 6), np.exp(rng.uniform(-1.0, 4.0, 6))
+    ends = np.concatenate([[0.0], np.cumsum(lasts)])
+    t = np.arange(0.0, ends[-1], 0.01)
+    x = np.round(np.interp(t, ends, np.concatenate([[0.0], np.cumsum(lasts * V)])) / 1.7) * 1.7
+    drive, _ = drive_from_displacement(t, x, "stage")
+    assert np.isfinite(drive.velocities).all()

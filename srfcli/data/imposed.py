@@ -550,11 +550,12 @@ def _heights(t: Array, x: Array, sigma: Array, knots: Array) -> Array:
 def _polished(t: Array, x: Array, sigma: Array, knots: Array) -> tuple[Array, Array]:
     """Return the knots moved to their least-squares places, and the heights there: damped Gauss-Newton on both."""
     heights = _heights(t, x, sigma, knots)
-    misfit, damping = _misfit(t, x, sigma, knots), 1e-3
+    misfit, damping, closest = _misfit(t, x, sigma, knots), 1e-3, 0.5 * float(np.diff(t).min())
     for _ in range(CORNER_ROUNDS if knots.size > 2 else 0):
         move = _step(t, x, sigma, knots, heights, damping)
         gaps = np.diff(knots)
-        room = 0.4 * np.minimum(gaps[:-1], gaps[1:])
+        least = np.minimum(gaps[:-1], gaps[1:])
+        room = np.clip(0.5 * (least - closest), 0.0, 0.4 * least)  # knots stay apart
         trial = knots.copy()
         trial[1:-1] += np.clip(move[1:-1], -room, room)
         found = _misfit(t, x, sigma, trial)
