@@ -470,7 +470,7 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory, model: Any) -> tuple[Any
     text += TABLE + TABLE.replace("loads.csv", "held.csv") + "holdout = true\n"
     place = folder_of(tmp_path_factory.mktemp("diagnosed"), text, loads=loads, held=held)
     rivals = ["interface-compliance", "load-transmission", "linker-dieterich", "stiffness-error"]
-    found = srf.diagnose(place, effects=[*rivals, "sensor-lag", "track-topography"])
+    found = srf.diagnose(place, effects=[*rivals, "sensor-lag", "track-topography", "drive-ripple"])
     found.write(place / "found")
     return found, place / "found"
 
@@ -486,7 +486,7 @@ def test_a_diagnosis_of_loads_alone_names_what_the_baseline_lacks(diagnosed: tup
         assert tables[name]["chi2"]["augmented"] < 20 < 40 < tables[name]["chi2"]["baseline"]
     assert "critical loads have chi2" in found.diagnosis.baseline.against[0]
     reasons = {x["effect"]: x["reason"] for x in found.answer["not_identifiable"]}
-    for effect in ("sensor-lag", "track-topography"):
+    for effect in ("sensor-lag", "track-topography", "drive-ripple"):
         assert reasons[effect].startswith("critical loads do not depend on it")
     assert not found.run_table.rows and len(found.load_table.rows) == 2
     assert len(found.plot().axes) == 1

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.core.errors import SrfError, as_names
 from srfcli.core.settings import DEFAULTS, Parameter, Resolved, resolve
-from srfcli.laws.registry import Registry, load_registry
+from srfcli.laws.registry import Registry, chosen_instead, load_registry
 from srfcli.laws.values import Effect
 
 if TYPE_CHECKING:
@@ -182,9 +182,7 @@ def check_effects(registry: Registry, effects: Sequence[str]) -> None:
     for name in as_names(effects, "effects"):
         effect = registry.get("effect", name)
         assert isinstance(effect, Effect)
-        instead = [f"{key} = {str(value).lower()}" for key, value in effect.settings]
-        instead += [{"K": "another stiffness", "M": "a mass"}.get(freed, freed) for freed in effect.frees]
-        if instead:
+        if instead := chosen_instead(effect):
             raise SrfError(f"'{effect.name}' only replaces what the system is", f"Choose {' and '.join(instead)}.")
 
 

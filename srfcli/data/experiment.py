@@ -34,7 +34,7 @@ from srfcli.data.values import (
     Signal,
     per_elongation,
 )
-from srfcli.laws.registry import Registry
+from srfcli.laws.registry import Registry, chosen_instead
 from srfcli.laws.values import Effect
 from srfcli.motion.imposed import Load, runs_of
 
@@ -145,9 +145,7 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
         with entry.blamed():
             effect = registry.get("effect", name)
         assert isinstance(effect, Effect)
-        if effect.settings or effect.frees:
-            instead = [f"{key} = {str(value).lower()} in [model]" for key, value in effect.settings]
-            instead += [{"K": "another stiffness in [apparatus]", "M": "a mass in [apparatus]"}.get(n, n) for n in effect.frees]
+        if instead := chosen_instead(effect, " in [model]", " in [apparatus]"):
             entry.fail(f"'{effect.name}' only replaces what the description says itself", f"Write {', '.join(instead)}.")
         names.append(name)
         found.append(effect)

@@ -147,7 +147,7 @@ def _straight_velocities(t: Array, V: Array, rounding: float) -> Drive:
 
 def _segmented(t: Array, V: Array) -> tuple[Drive, int]:
     """Return straight pieces of a noisy velocity, constant where a slope is not needed, and their number."""
-    sigma = coloured_noise(t, V)
+    sigma = coloured_noise(t, V, local_noise(V), quantisation(V))
     penalty = 3 * np.log(V.size)
     breaks = split(t, V, sigma, penalty)
     pieces = [_piece(t[a:b], V[a:b], sigma[a:b], penalty) for a, b in pairwise([0, *breaks, V.size])]
@@ -190,9 +190,8 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         f"a continuous line of {slopes.size} {pieces}, {told} um/s, fitted through the displacements, "
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
-    noise = max(float(np.median(local_noise(X[known]))), quantisation(X[known]) / np.sqrt(12.0))
-    if line.misfit > UNEXPLAINED * noise:
-        what += f", {line.misfit / noise:.0f} times their noise: look at the column, or state the run's drive"
+    if line.misfit > UNEXPLAINED * line.noise:
+        what += f", {line.misfit / line.noise:.0f} times their noise: look at the column, or state the run's drive"
     back = int(np.argmin(way))
     if -way[back] > line.misfit:
         told = f"{-way[back]:.3g} um at t = {line.knots[back]:.7g} s"
@@ -286,6 +285,7 @@ class Line:
     knots: Array
     heights: Array
     misfit: float
+    noise: float  # white, rounding included
     jumps: tuple[tuple[int, float], ...]
 
 
@@ -336,15 +336,16 @@ def split(t: Array, x: Array, sigma: Array, penalty: float) -> list[int]:
     return sorted(found)
 
 
-def coloured_noise(t: Array, x: Array) -> Array:
+def coloured_noise(t: Array, x: Array, sigma: Array, step: float) -> Array:
     """Return for each sample the standard deviation of white noise that misfits a line as much as the noise in x (n,) does.
+
+    `sigma` (n,) is the white noise near each sample, `step` that of an encoder.
 
     The noise is the residual of parabolas over 128 samples, in the upper quartile of fifteen stretches: a gauge's bursts count.
     Corners and level jumps do not: what lowers a stretch's residual by a factor of CORNER is no noise.
     """
     from scipy.ndimage import percentile_filter
 
-    sigma, step = local_noise(x), quantisation(x)
     length = min(STRETCH, x.size)
     starts = np.arange(0, x.size - length + 1, length)
     found = np.empty(starts.size)
@@ -396,7 +397,8 @@ def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
     the noise enters it with its correlation over 128 samples. Least squares place the knots. A change of slope by less than 2 %
     comes from the servo and is not followed.
     """
-    sigma = coloured_noise(t, x)
+    white, step = local_noise(x), quantisation(x)
+    sigma = coloured_noise(t, x, white, step)
     penalty, jumps = 3 * np.log(t.size), []
     for _ in range(4):
         breaks = split(t, x, sigma, penalty)
@@ -417,7 +419,7 @@ def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
     knots = _pruned(t, x, sigma, knots, penalty)
     knots, heights = _polished(t, x, sigma, knots)
     misfit = float(np.sqrt(np.mean((x - np.interp(t, knots, heights)) ** 2)))
-    return Line(knots, heights, misfit, tuple(sorted(jumps)))
+    return Line(knots, heights, misfit, max(float(np.median(white)), step / np.sqrt(12.0)), tuple(sorted(jumps)))
 
 
 def _without_bursts(t: Array, sigma: Array, knots: Array, heights: Array) -> Array:

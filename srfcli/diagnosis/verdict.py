@@ -375,5 +375,10 @@ def parameters_of(fitted: Fitted) -> dict[str, dict[str, Any]]:
 
 def brought(diagnosis: Diagnosis) -> Mapping[str, Mapping[str, Any]]:
     """Return the parameters that the final model adds to the baseline's."""
-    own = {q.name for q in diagnosis.baseline.fit.likelihood.problem.experiment.parameters}
-    return {n: v for n, v in parameters_of(diagnosis.final).items() if n not in own and "." not in n}
+    return added(diagnosis.final, diagnosis.baseline)
+
+
+def added(fitted: Fitted, baseline: Fitted) -> dict[str, dict[str, Any]]:
+    """Return the parameters that a model has and the baseline has not, those of single runs left out."""
+    own = {q.name for q in baseline.fit.likelihood.problem.experiment.parameters}
+    return {n: v for n, v in parameters_of(fitted).items() if n not in own and "." not in n}

@@ -25,7 +25,7 @@ from srfcli.core.cache import header_key, known_headers, user_base
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import check_plain, open_plain, read_plain
 from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, read_header, read_toml, valid_name
-from srfcli.laws.values import AgeingLaw, AgeingModifier, Law, Reader
+from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, Law, Reader
 
 GROUP = "srf.laws"
 PLUGIN_SOURCES = ("--plugins", "SRF_PLUGINS")
@@ -150,6 +150,16 @@ class Registry:
     def fingerprint(self, entry: Entry) -> str:
         """Return the sha256 of the file that holds a law."""
         return hashlib.sha256(read_plain(entry.location)).hexdigest()
+
+
+def chosen_instead(effect: Effect, model: str = "", apparatus: str = "") -> list[str]:
+    """Return what is to be chosen in place of an effect that only changes what the system is, nothing for any other effect.
+
+    `model` and `apparatus` are appended to say where.
+    """
+    instead = [f"{key} = {str(value).lower()}{model}" for key, value in effect.settings]
+    freed = {"K": f"another stiffness{apparatus}", "M": f"a mass{apparatus}"}
+    return instead + [freed.get(name, name) for name in effect.frees]
 
 
 def _what(kind: str) -> str:

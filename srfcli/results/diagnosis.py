@@ -18,7 +18,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
 from srfcli.diagnosis.answer import RunView, answer, load_views, material, parameter_rows, ranked_rows, run_views
 from srfcli.diagnosis.design import DiscriminatingRun, discriminating_files
-from srfcli.diagnosis.verdict import parameters_of
+from srfcli.diagnosis.verdict import added
 from srfcli.results.provenance import Provenance, write_result
 from srfcli.results.report_figures import loads_figure, run_figure, trace
 from srfcli.results.report_text import unit_text
@@ -184,10 +184,9 @@ class DiagnosisResult(Result):
 
     def _added(self, fitted: Fitted) -> list[str]:
         """Return the parameters that a model has and the baseline has not, as text."""
-        listed = {q.name for q in self.diagnosis.baseline.fit.likelihood.problem.experiment.parameters}
         told = []
-        for name, found in parameters_of(fitted).items():
-            if name not in listed and name != "ratio" and "." not in name:
+        for name, found in added(fitted, self.diagnosis.baseline).items():
+            if name != "ratio":
                 unit, factor = self.diagnosis.experiment.shown(str(found["unit"]))
                 shown = "" if unit == "1" else f" {unit}"
                 told.append(f"{name} = {found['value'] * factor:.5g} +- {found['stderr'] * factor:.2g}{shown}")

@@ -258,8 +258,18 @@ class FitResult(Result):
                 told.append(f"the friction field is {100 * share:.1g} % of the friction, more than a track has")
         if found.state_space is not None and found.status.ok:
             failed = [text for text in shortcomings(found.state_space) if not text.startswith("the field's amplitude")]
-            told += [f"the fit fails a test: {text}" for text in failed[:TESTS_TOLD]]
+            told += [f"the fit fails a test: {text}" for text in dict.fromkeys(failed[:TESTS_TOLD])]
         return told
+
+    @cached_property
+    def values_with_means(self) -> dict[str, float]:
+        """Return every parameter's value in um, s, N, fitted or stated; of one that varies between groups the mean, too."""
+        found = self.found
+        known = {q.name: q.value for q in self.experiment.parameters} | found.fit.values
+        for name, each in found.problem.groups.items():
+            scatter = found.scatter.get(name)
+            known[name] = scatter.mean if scatter else float(np.mean([known[n] for n in each]))
+        return known
 
     @cached_property
     def difference(self) -> tuple[float, float | None] | None:
@@ -267,16 +277,12 @@ class FitResult(Result):
 
         The error is None where one varies or stands at a bound.
         """
-        found, names, groups = self.found, ("A", "B"), self.found.problem.groups
-        known = {q.name: q.value for q in self.experiment.parameters} | found.fit.values
-        for name, each in groups.items():
-            scatter = found.scatter.get(name)
-            known[name] = scatter.mean if scatter else float(np.mean([known[n] for n in each]))
+        found, names, known = self.found, ("A", "B"), self.values_with_means
         if not {*names} <= known.keys():
             return None
         free = [found.fit.names.index(n) for n in names if n in found.fit.names]
         own = np.asarray(found.fit.covariance)[np.ix_(free, free)]
-        if not free or {*names} & groups.keys() or not (np.diag(own) > 0).all():
+        if not free or {*names} & found.problem.groups.keys() or not (np.diag(own) > 0).all():
             return known["A"] - known["B"], None
         signs = np.array([1.0 if found.fit.names[k] == "A" else -1.0 for k in free])
         return known["A"] - known["B"], float(np.sqrt(max(float(signs @ own @ signs), 0.0)))

@@ -131,9 +131,7 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     listed = {q.name for q in experiment.parameters}
     own = [name for name in result.names if name in listed]
     parameters = {name: (table[name][1], _number(table[name][2]), table[name][5]) for name in own}
-    values = {**{q.name: q.value for q in experiment.parameters}, **result.values}
-    varied = found.found.scatter  # of what varies the mean counts
-    values |= {name: s.mean if s else float(np.mean([values[n] for n in problem.groups[name]])) for name, s in varied.items()}
+    values = found.values_with_means
     for name, mean, error, _, unit, _ in found.varied.rows if found.varied else ():  # without an error where one is at its bound
         shown = from_base(values[name], unit) if mean is None else mean
         parameters[name] = (shown, _number(error), unit)
