@@ -5,7 +5,8 @@
     slider = srf.system("srf-vsat", K="0.21 N/um")
     srf.linear(slider).plot()
 
-Each function is a command of `srf`: values in, a result out, with `.table`, `.to_dataframe()`, `.to_xarray()` and `.plot()`.
+`system`, `load_law` and `read_experiment` prepare the input. Every other function does the work of one command and returns a
+result with `.table`, `.to_dataframe()`, `.to_xarray()` and `.plot()`; `continue_boundary` returns an iterator of such results.
 """
 
 from __future__ import annotations

@@ -157,7 +157,7 @@ def test_every_command_has_help_with_examples_or_subcommands() -> None:
         (["run", "--fail", "bug"], 1, ["Error: unexpected TypeError: a b\n", "--debug"]),
         (["run", "--fail", "interrupt"], 130, ["Error: interrupted"]),
         (["run", "--fail", "no-convergence"], 3, ["Newton's method did not converge"]),
-        (["run", "--fail", "interrupted"], 130, ["what was finished is kept"]),
+        (["run", "--fail", "interrupted"], 130, ["What was finished is kept"]),
         (["run", "--fail", "closed"], 0, []),
     ],
 )

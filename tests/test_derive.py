@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from srfcli.cli.main import cli
 from srfcli.laws.expression import symbol
 from srfcli.laws.registry import bundled_registry
-from srfcli.numerics.hopf import hopf_points
+from srfcli.numerics.hopf import hopf_points, weakening
 from srfcli.symbolic.derivation import dispersion_coefficients
 from srfcli.symbolic.derive import (
     characteristic_polynomial,
@@ -140,12 +140,11 @@ def test_limit_of_a_stiff_interface(make_model: Callable[..., Any]) -> None:
     for V in (1.0, 10.0, 100.0):
         p = model.vector({"V": V, "lambda": 1e-11})
         (found,) = hopf_points(model, p)
-        slopes = model.slopes(p)
-        value = {n: p[model.index(n)] for n in ("K", "M", "D0")}
-        dmu = slopes[1] - slopes[0]
-        right = dmu * (1 + value["M"] * V**2 / (found.W0 * value["D0"] * slopes[0]))
+        value = {n: p[model.index(n)] for n in ("K", "M", "D0", "A")}  # of this law mu_v = A
+        dmu = weakening(model, p)
+        right = dmu * (1 + value["M"] * V**2 / (found.W0 * value["D0"] * value["A"]))
         assert value["K"] * value["D0"] / found.W0 == pytest.approx(right, rel=1e-10)
-        assert value["D0"] * found.Omega / V == pytest.approx(math.sqrt(dmu / slopes[0]), rel=1e-10)
+        assert value["D0"] * found.Omega / V == pytest.approx(math.sqrt(dmu / value["A"]), rel=1e-10)
         assert model.limit_load(p) == pytest.approx(found.W0, rel=1e-10)
         light = model.vector({"V": V, "lambda": 1e-11, "M": 1e-18})
         (point,) = hopf_points(model, light)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import lambertw
 
 import srfcli as srf
-from srfcli.core.errors import Status
+from srfcli.core.errors import SrfError, Status
 from srfcli.motion.imposed import ConstantLoad, Drive
 from srfcli.motion.simulate import simulate
-from srfcli.numerics.hopf import critical_point, hopf_points, rest_state
+from srfcli.numerics.hopf import critical_point, hopf_points, rest_state, weakening
 
 
 def settled_swing(model, V: float, W0: float, Omega: float, swing: float) -> float:
@@ -84,3 +85,74 @@ def test_a_distorted_load_without_a_mass_is_the_limit_of_a_small_one():
     loads.append(srf.critical(srf.system(**distorted, M=1e-3), V=10, eps=0.1))
     massless, light = (found.table.rows[0][[c.name for c in found.table.columns].index("W0")] for found in loads)
     assert massless == pytest.approx(light, rel=2e-5) != 8.0
+
+
+RATES = {  # rate in x = v phi/D0, its parameters, and the same as a function
+    "1 - n*(v*phi/D0)**2": ({"n": 0.5}, lambda x: 1 - 0.5 * x**2),
+    "1 - n*(v*phi/D0) - m*(v*phi/D0)**2": ({"n": 0.3, "m": 0.9}, lambda x: 1 - 0.3 * x - 0.9 * x**2),
+    "(v*phi/D0 - 1)*(2 - v*phi/D0)": ({}, lambda x: (x - 1) * (2 - x)),
+}
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_steady_sliding_is_where_the_age_is_positive_and_attracts(tmp_path, rate):
+    """The critical load of a rate with several roots, against eigenvalues of equations written by hand about the right one."""
+    parameters, by_hand = RATES[rate]
+    text = f'format = "srf-law/1"\nkind = "ageing"\nname = "own"\nrate = "{rate}"\n[parameters]\n'
+    path = tmp_path / "own.toml"
+    path.write_text(text + "".join(f"{name} = {{ default = {value} }}\n" for name, value in parameters.items()))
+    system = srf.system(ageing=str(path))
+    found = srf.linear(system, over={"V": [10.0]}).to_dataframe().iloc[0]
+    assert found["status"] == "ok"
+    A, B, D0, Vsat, lam, K, M, V = 0.0126, 0.0241, 0.402, 256.0, 0.56, 0.21, 2.37e-6, 10.0
+    places = np.arange(3.0)
+    root = max(np.roots(np.polyfit(places, by_hand(places), 2)))  # the larger of two positive ones attracts
+    slope = (by_hand(root + 1e-6) - by_hand(root - 1e-6)) / 2e-6
+    W0, c = float(found["W0"]), B * Vsat * root / (V + Vsat * root)
+    phi_row = np.array([0.0, 0.0, 1.0, 1.0]) * slope * V / D0  # (ln phi)' by u, z, ln v, ln phi
+    slip_row = (np.array([0.0, 1.0, -V, 0.0]) / lam - c * phi_row) / A  # of d(W0 mu/kappa)/dt = z - v
+    J = np.array([[0, -1, 0, 0], [K / M, 0, -W0 * A / M, -W0 * c / M], slip_row, phi_row])
+    leading = max(np.linalg.eigvals(J), key=lambda s: (s.real, s.imag))
+    assert abs(leading.real) < 1e-6 * leading.imag
+    assert leading.imag == pytest.approx(found["Omega_c"], rel=1e-8)
+    assert found["Omega_rigid"] == pytest.approx(found["Omega_c"], rel=1e-8)  # with kappa ~ W the frequency is the rigid one's
+
+
+def test_what_has_no_attracting_steady_state_is_refused(tmp_path):
+    text = 'format = "srf-law/1"\nkind = "ageing"\nname = "own"\nrate = "{}"\n[parameters]\nc = {{ default = 0.5 }}\n'
+    for rate, said in (
+        ("-(v*phi/D0)*log(v*phi/D0) - c", "no steady state that attracts"),
+        ("1 - c*(mu/mu0)*v*phi/D0", "depends on mu"),
+        ("exp(-c*v*phi/D0) - sinh(v*phi/D0)", "no closed form"),
+    ):
+        path = tmp_path / "own.toml"
+        path.write_text(text.format(rate))
+        with pytest.raises(SrfError, match=said):
+            srf.linear(srf.system(ageing=str(path)), over={"V": [10.0]})
+
+
+@pytest.mark.parametrize("V", [0.003, 0.02, 1.0])
+def test_weakening_counts_that_the_steady_age_is_not_proportional_to_one_over_V(make_model, V):
+    """kato-tullis: -d mu_ss/d ln V = B (1 + (V/Vc) w/(1 + w)) - A in the limit Vsat phi >> D0, w = W(exp(-V/Vc))."""
+    model = make_model(law="dieterich-ruina", ageing="kato-tullis")
+    p = model.vector({"V": V})
+    A, B, Vc = (p[model.index(n)] for n in ("A", "B", "Vc"))
+    w = lambertw(np.exp(-V / Vc)).real
+    assert weakening(model, p) == pytest.approx(B * (1 + (V / Vc) * w / (1 + w)) - A, rel=1e-9)
+
+
+def test_an_age_that_depends_on_the_load_is_at_rest_under_the_mean_load(tmp_path):
+    """Under an inclined spring W = W0 + K (u - u_ss) tan(angle), u_ss under W0: W follows the imposed load one to one."""
+    path = tmp_path / "own.toml"
+    path.write_text(
+        'format = "srf-law/1"\nkind = "ageing"\nname = "own"\nrate = "(W/Wref)**q - v*phi/D0"\n'
+        '[parameters]\nq = { default = 0.5 }\nWref = { default = 10.0, unit = "N" }\n'
+    )
+    model = srf.system(ageing=str(path), loading="inclined").model
+    p = model.vector({"V": 10.0, "W0": 5.0})
+    x = np.asarray(model.steady(p))
+    assert x[model.states.index("ln_phi")] == pytest.approx(np.log(0.402 * 0.5**0.5 / 10.0), rel=1e-12)
+    assert model.load(x, 10.0, 5.5, 0.0, p) - model.load(x, 10.0, 5.0, 0.0, p) == pytest.approx(0.5, rel=1e-12)
+    assert np.abs(model.rates(x, 10.0, 5.0, 0.0, p)).max() < 1e-9
+    flat = srf.linear(srf.system(ageing=str(path)), over={"V": [10.0]}).to_dataframe().iloc[0]
+    assert flat["W0"] == pytest.approx(7.888035439563494, rel=1e-9)

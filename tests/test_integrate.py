@@ -193,3 +193,14 @@ def test_misuse_raises(model, change, message):
 def test_programs_refuse_what_makes_no_sense(make):
     with pytest.raises(SrfError):
         make()
+
+
+@pytest.mark.parametrize("f", [0.1, 0.5, 2.0])
+@pytest.mark.parametrize("on, off", [(2.0, 999.0), (20.0, 999.0), (30.0, 100.0), (60.0, 75.0)])
+def test_a_noisy_load_keeps_the_onset_and_the_end_of_an_oscillation(f: float, on: float, off: float) -> None:
+    t = np.arange(0.0, 150.0, 0.05)
+    envelope = 1 / (1 + np.exp(-(t - on) / 0.4)) / (1 + np.exp(np.clip((t - off) / 0.4, -50, 50)))
+    true = 10 * (1 + 0.05 * envelope * np.sin(2 * np.pi * f * t))
+    noisy = true + np.random.default_rng(1).normal(0.0, 0.002, t.size)
+    found = SampledLoad(t, noisy, noise=0.002)(t)[0]
+    assert np.abs(found - true).max() < 0.01

@@ -14,11 +14,12 @@ from srfcli.data.groups import grouped
 from srfcli.data.values import FitParameter
 from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.scores import Remainder, Scores
-from srfcli.diagnosis.search import SHARED, ModelSearch
+from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import conclude
 from srfcli.inference import state_space
 from srfcli.inference.state_space import (
     DEVIATION,
+    NEEDED,
     Likelihood,
     StateSpaceFit,
     correlated,
@@ -189,7 +190,7 @@ def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, fitted):
     experiment = read_experiment(recorded(tmp_path, Physics(), shared=True), registry=SHIPPED, holdout=False)
     remainder = Remainder(fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=()))
     found = remainder.shared
-    assert found.gain > SHARED > Remainder(fitted).shared.gain
+    assert found.gain > NEEDED > Remainder(fitted).shared.gain
     absorbed = (found.u * found.absorbed) @ found.u.T  # I - inverse of the covariance
     inverse = np.eye(remainder.left.size) - absorbed
     gain = 0.5 * remainder.left @ absorbed @ remainder.left + 0.5 * np.linalg.slogdet(inverse)[1]
@@ -204,7 +205,7 @@ def test_a_field_that_all_runs_share_counts_alike_under_every_model(tmp_path):
     random = [f for f in found.ranked if "track-topography" not in f.name]
     assert {"none", "linker-dieterich"} <= {f.name for f in random}
     assert len({f.remainder.shared.gain for f in random}) > 1  # each its own
-    gain = found.best.remainder.shared.gain - SHARED
+    gain = found.best.remainder.shared.gain - NEEDED
     assert gain > 0 and [f.evidence - f.separate for f in random] == pytest.approx([gain] * len(random))
     assert all(f.evidence == f.separate for f in found.ranked if f not in random)
 

@@ -379,3 +379,37 @@ def test_real_recordings(path: Path, stiffness: str, unit: str) -> None:
         pytest.skip(f"REFERENCE DATA ABSENT: {path} does not exist; set SRF_SHARED to check against it")
     srf("new", str(path), "--stiffness", stiffness)
     assert f"W [{unit}]" in srf("check", ".", "--no-simulate").stdout
+
+
+@pytest.mark.parametrize("heading", ["Load point \u00b5m", "Load point_\u03bcm", "Load point (\u00b5m)"])
+def test_a_micro_sign_is_read(heading: str, step: dict[str, np.ndarray]) -> None:
+    table(
+        ["time [s]", heading, "Shear stress [MPa]", "Normal stress [MPa]"],
+        [step["t"], step["x"], SIGMA * step["mu"], step["sigma"]],
+    )
+    done = srf("new", "run1.csv", "--stiffness", "40 MPa/mm")
+    assert "the drive goes from 1 to 10 um/s" in done.stderr
+
+
+def test_a_power_of_ten_in_a_heading_is_not_dropped(step: dict[str, np.ndarray]) -> None:
+    headings = ["time [s]", "Disp 10^-3 mm", "Shear stress [MPa]", "Normal stress [MPa]"]
+    table(headings, [step["t"], step["x"], SIGMA * step["mu"], step["sigma"]])
+    done = srf("new", "run1.csv", "--stiffness", "40 MPa/mm", code=2)
+    assert "10^-3 mm" in done.stderr
+
+
+def test_a_record_that_begins_before_sliding_is_steady_begins_free(step: dict[str, np.ndarray]) -> None:
+    mu = step["mu"] * (1 - 0.8 * np.exp(-step["t"] / 3.0))
+    table(["time [s]", "x [um]", "Shear stress [MPa]", "Normal stress [MPa]"], [step["t"], step["x"], SIGMA * mu, step["sigma"]])
+    done = srf("new", "run1.csv", "--stiffness", "40 MPa/mm", "--column", "load_point_displacement=x [um]")
+    assert "the initial state of run1 is estimated, as its friction begins at 2" in done.stderr
+    assert 'initial = "free"' in Path("experiment.toml").read_text()
+
+
+@pytest.mark.parametrize("stress, stiffness", [(True, "40 kN/mm"), (False, "40 MPa/mm")])
+def test_a_stiffness_per_stress_beside_forces_needs_the_area(stress: bool, stiffness: str, step: dict[str, np.ndarray]) -> None:
+    units = ("Shear stress [MPa]", "Normal stress [MPa]") if stress else ("Shear force [kN]", "Normal force [kN]")
+    table(["time [s]", "LP Disp [um]", *units], [step["t"], step["x"], SIGMA * step["mu"], step["sigma"]])
+    done = srf("new", "run1.csv", "--stiffness", stiffness, code=2)
+    assert "the stiffness is in" in done.stderr and "area" in done.stderr
+    assert not Path("experiment.toml").exists()

@@ -214,7 +214,8 @@ def test_a_description_that_is_none(content: bytes, message: str, tmp_path: Path
 def test_a_data_file_is_no_description(tmp_path: Path, registry: Registry) -> None:
     place = write(tmp_path) / "one.csv"
     found, hint = answer(place, registry)
-    assert found == f"{place}: a data file, not the description of an experiment" and "srf new" in hint
+    assert found == f"{place}: a data file, not the description of an experiment"
+    assert f"`srf new {place}`" in hint and "[[thresholds]]" in hint and f"`srf fit {place}`" in hint
 
 
 def test_a_file_that_may_not_be_read_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from srfcli.core.errors import SrfError
 from srfcli.data.clock import Place
 from srfcli.data.experiment import NOTICE_KINDS, check_run, read_experiment
 from srfcli.data.gauge import GaugeNoise, find_noise, whiten
-from srfcli.data.imposed import drive_from_displacement, find_modulation, load_from_column
+from srfcli.data.imposed import drive_from_displacement, drive_from_velocity, find_modulation, load_from_column
 from srfcli.data.noise import measured, spikes
 from srfcli.data.values import Run
 from srfcli.laws.registry import load_registry
@@ -471,6 +471,9 @@ def test_stress_counts_as_force_on_a_square_millimetre(tmp_path: Path) -> None:
     c = Columns()
     c.heading = HEADING.replace("normal_load [N]", "normal_stress [kPa]")
     c.W *= 1000
+    with pytest.raises(SrfError, match="the stiffness is in N/um, and 'normal_stress"):
+        c.read(tmp_path)
+    c.toml = c.toml.replace("0.21 N/um", "210 MPa/mm")
     assert c.read(tmp_path).load(np.array([1.0]))[0] == pytest.approx([5.0], rel=1e-12)
 
 
@@ -520,6 +523,27 @@ def test_steps_that_are_many_or_short_beside_the_record(steps: list[tuple[float,
     drive, _ = drive_from_displacement(t, displacements, "stage")
     assert drive.velocities == pytest.approx([V for _, V in steps], rel=2e-3)
     assert drive.breaks == pytest.approx(ends[1:-1], abs=0.1)
+
+
+@pytest.mark.parametrize("interval", [0.1, 0.5, 30.0])
+@pytest.mark.parametrize("count", [1e-3, 1.0])
+def test_holds_of_a_column_without_noise_are_its_drive(interval: float, count: float) -> None:
+    """A command, or an encoder whose counts divide the way; a hold may be logged by its two ends alone."""
+    t, x, at, way = [], [], 0.0, 0.0
+    for V, duration in ((10.0, 30.0), (0.0, 30.0), (10.0, 25.0), (0.0, 120.0), (10.0, 25.0), (0.0, 300.0), (10.0, 25.0)):
+        own = np.arange(0.0, duration - 1e-9, 0.1 if V else interval)
+        t, x = [*t, *(at + own)], [*x, *(way + V * own)]
+        at, way = at + duration, way + V * duration
+    drive, _ = drive_from_displacement(np.array(t), count * np.round(np.array(x) / count), "stage")
+    assert np.allclose(drive.velocities, [10, 0, 10, 0, 10, 0, 10], atol=1e-3)
+    assert np.allclose(drive.times, [0, 30, 60, 85, 205, 230, 530], atol=0.02)
+
+
+def test_holds_of_a_noisy_column_of_velocities_stand_still() -> None:
+    t = np.arange(0.0, 120.0, 0.05)
+    V = np.where((t > 40) & (t < 80), 0.0, 10.0) + np.random.default_rng(3).normal(0.0, 0.2, t.size)
+    drive, _ = drive_from_velocity(t, V, "ram")
+    assert drive.velocities[1] == 0.0 and np.allclose(drive.velocities, [10, 0, 10], atol=0.05)
 
 
 def test_counts_of_an_encoder_are_no_steps_of_the_drive() -> None:

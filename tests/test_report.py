@@ -134,6 +134,7 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
         material["diagram"] = {"V": V, "W0_baseline": 7 + np.log(V), "W0_augmented": 8 + np.log(V), "note": "at eps = 0.18"}
     if verdict == "ambiguous":
         material["discriminating"] = ["Step the load from 5 to 9 N."]
+        material["alternatives"] = ["linker-dieterich: alpha = 0.012 +- 0.0004", "second-state: B2 = 0.004 +- 0.0002"]
     return material
 
 
@@ -290,6 +291,7 @@ def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Pat
     assert ("bent B by 10 standard errors" in page.text) != nothing
     assert ("leave the same trace" in page.text) == (verdict == "ambiguous")
     assert ("Step the load from 5 to 9 N." in page.text) == (verdict == "ambiguous")
+    assert ("second-state: B2 = 0.004 +- 0.0002" in page.text) == (verdict == "ambiguous")
     assert ("0.3*log(v/V0) < 1" in page.text) == (verdict == "unknown")
     assert "the mass is <known>" in page.text
     assert 'matplotlib, which is not installed: pip install "srfcli[plot]"' in page.text

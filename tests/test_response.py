@@ -61,6 +61,18 @@ def settled(model, f, eps, *, V=10.0, W0=6.0, periods=400, samples=64):
     return trace
 
 
+def test_a_load_point_that_moves_with_the_load_carries_the_slider(make_model):
+    """The slider's position under `poisson-coupling` is its velocity, an unknown of its own, over i omega."""
+    model = make_model(effects=("poisson-coupling",), stability=True)
+    p = model.vector({"V": 10.0, "W0": 5.0, "f": 100.0, "shift": 0.05, "eps": 0.0})
+    rest, n, by_eps = model.steady(p), len(model.states), model.cycle_parameter("eps")
+    forcing = by_eps(0.0, rest, p) - 1j * by_eps(0.25, rest, p)
+    z = np.linalg.solve(2j * np.pi * np.eye(n) - model.cycle_jacobian(0.0, rest, p), forcing)[model.states.index("z")]
+    found = linear_response(model, p).position
+    assert found == pytest.approx(z / (2j * np.pi * 100.0), rel=1e-9)
+    assert abs(found) == pytest.approx(0.605103, rel=1e-5)  # of another's equations and solver
+
+
 def test_the_linear_response_is_that_of_a_simulation(model):
     trace = settled(model, 120.0, 1e-3)
     found = linear_response(model, model.vector({"V": 10.0, "W0": 6.0, "f": 120.0}))

@@ -184,7 +184,7 @@ def test_what_is_no_range_is_told(text: str) -> None:
 def test_a_map_with_an_edge_that_has_no_value() -> None:
     plane = ["--over", "B=0:0.02:3:lin", "--over", "K/W0=0.01:0.03:3", "--V", "10", "--eps", "0.1"]
     done = srf("map", *plane, "--ageing", "nagata")
-    assert done.exit_code == 3 and "no-value at 3 points: A formula has no value" in done.output
+    assert done.exit_code == 3 and "no-value at 3 points: A formula is undefined" in done.output
 
 
 def test_what_steady_sliding_does_not_have_is_not_swept() -> None:

@@ -63,8 +63,8 @@ def switches() -> list[click.Option]:
     """Return the options -q, -v, --debug and --trust; they set the session and are no argument of the command."""
     common: dict[str, Any] = {"expose_value": False, "callback": _switch, "is_eager": True}
     return [
-        click.Option(["-q", "--quiet"], is_flag=True, help="No progress and no remarks on stderr.", **common),
-        click.Option(["-v", "--verbose"], count=True, show_default=False, help="Say more on stderr.", **common),
+        click.Option(["-q", "--quiet"], is_flag=True, help="Print no progress and no notes.", **common),
+        click.Option(["-v", "--verbose"], count=True, show_default=False, help="Print more detail to stderr.", **common),
         click.Option(["--debug"], is_flag=True, help="Show the traceback of an error.", **common),
         click.Option(["--trust"], is_flag=True, help="Run Python that an experiment or srf.toml names.", **common),
     ]

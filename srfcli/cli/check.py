@@ -15,7 +15,7 @@ from srfcli.core.errors import SrfError, did_you_mean
 EXAMPLES = """
 srf check experiment/                              sampling, flaws, noise, drive and load of every run
 srf check experiment/ --plot check.svg             the runs as figures, flagged samples marked
-srf check experiment/ --no-simulate                what is in the files, and nothing about what it can tell
+srf check experiment/ --no-simulate                check the files only, without simulation
 srf check experiment/ --fail-on gap --fail-on reset && srf fit experiment/
 srf check experiment/ --json | jq .meta.runs       all that was found
 """
@@ -35,7 +35,9 @@ srf check experiment/ --json | jq .meta.runs       all that was found
     metavar="MB",
     help="Largest recording that is held in memory.",
 )
-@click.option("--simulate/--no-simulate", default=True, help="Simulate each run to say what its load can tell.")
+@click.option(
+    "--simulate/--no-simulate", default=True, help="Simulate each run to compute the Cramer-Rao bounds of alpha, lambda and n."
+)
 @plugins_option
 @output_options
 def command(
@@ -48,7 +50,7 @@ def command(
     plugins: tuple[Path, ...],
     output: OutputOptions,
 ) -> int:
-    """Read and validate an experiment and report what its recordings are like.
+    """Read and validate an experiment and report sampling, defects and noise of its recordings.
 
     Every value of the description is checked against the laws and the data files. For each run: sampling, gaps, spikes, resets,
     quantisation, level and colour of the noise, drive and load as they are in the data, and what the load's variation can tell.

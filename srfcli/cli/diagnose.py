@@ -40,8 +40,8 @@ def diagnose(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], 
 
     The baseline of the experiment is fitted with a random friction field and coloured gauge noise. Registered effects are scored
     for what they could explain beyond these, some only if --effect names them, and those with the highest scores are fitted.
-    Held-out runs are read when the models are final, and must be predicted. Verdicts are none, identified, ambiguous, unknown and
-    inconclusive.
+    Held-out runs are read after the search; a model that does not predict them is rejected. Verdicts are none, identified,
+    ambiguous, unknown and inconclusive.
     """
     from srfcli.results.diagnosis import check_answer
     from srfcli.tasks import diagnose as tasks

@@ -74,10 +74,17 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
 @click.option("--draws", metavar="FILE.nc", help="Keep the draws of --sample as ArviZ's netCDF.")
 @click.option("--seed", default=0, help="Seed of further starts and of the sampler.")
 @reader_option
-@click.option("--bounds", multiple=True, metavar="NAME=LO:HI", help="Bounds of a parameter, for a table of critical loads.")
-@click.option("--method", multiple=True, help="Minimiser of the critical loads' cost; both unless named.")
-@click.option("--tol", type=float, help="Relative error of a critical load.")
-@click.option("--max-evaluations", type=click.IntRange(1), help="Most evaluations of that cost, for each minimiser.")
+@click.option("--bounds", multiple=True, metavar="NAME=LO:HI", help="THRESHOLDS.csv only: bounds of a parameter.")
+@click.option(
+    "--method",
+    multiple=True,
+    metavar="[powell|least-squares]",
+    help="THRESHOLDS.csv only: minimiser of the cost; repeatable.  [default: both]",
+)
+@click.option("--tol", type=float, help="THRESHOLDS.csv only: relative error of a load; 1e-6 unless set.")
+@click.option(
+    "--max-evaluations", type=click.IntRange(1), help="THRESHOLDS.csv only: most evaluations of the cost, for each minimiser."
+)
 @worker_options
 @options_with_effects
 @output_options
@@ -88,7 +95,8 @@ def command(
 
     The gauge's noise, its level and colour, and a random friction field along slip are estimated with the parameters and count
     in their errors. Several experiments, or --table, are a campaign: each is fitted by itself and has a row. A CSV file is taken
-    for a table of critical loads, which the paper's procedure fits: the laws are then those of the options below.
+    for a table of critical loads, which the paper's procedure fits. The options that choose a system, from --law to --effect but
+    for --plugins, are for such a table only: an experiment states its own.
     """
     campaign, source = place is not None or len(sources) > 1, sources[0]
     if not campaign:

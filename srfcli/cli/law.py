@@ -41,7 +41,7 @@ srf laws --json | jq .rows          for a program
 @click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
 @plugins_option
 def laws(kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
-    """List the laws that are found; none is imported for that."""
+    """List all registered laws, without importing them."""
     registry = open_registry(plugins)
     emit.show(laws_table(registry, kind), "json" if as_json else "text")
     for problem in registry.problems:
@@ -72,7 +72,7 @@ def laws_table(registry: Registry, kind: str | None) -> Table:
 LAW_EPILOG = """
 srf law show srf-vsat               formula, parameters, references
 srf law new my-law                  write my-law.toml, ready to be changed
-srf law check my-law.toml           does it stand up?
+srf law check my-law.toml           check it
 srf linear --law my-law --plugins . its critical load
 """
 SHOW_EPILOG = """

@@ -17,7 +17,7 @@ from srfcli.core import ONE_THREAD, __version__
 
 # command -> module:attribute and the first sentence of its help, in the order of `srf --help`, which imports none of them
 COMMANDS = {
-    "laws": ("srfcli.cli.law:laws", "List the laws that are found; none is imported for that."),
+    "laws": ("srfcli.cli.law:laws", "List all registered laws, without importing them."),
     "law": ("srfcli.cli.law:law", "Show, write and check laws."),
     "derive": (
         "srfcli.cli.system:derive",
@@ -42,10 +42,14 @@ COMMANDS = {
     "response": ("srfcli.cli.stability:response", "How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t)."),
     "compare": (
         "srfcli.cli.map:compare",
-        "Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment tells them apart.",
+        "Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment discriminates "
+        "between them.",
     ),
     "new": ("srfcli.cli.new:command", "Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take."),
-    "check": ("srfcli.cli.check:command", "Read and validate an experiment and report what its recordings are like."),
+    "check": (
+        "srfcli.cli.check:command",
+        "Read and validate an experiment and report sampling, defects and noise of its recordings.",
+    ),
     "fit": (
         "srfcli.cli.fit:command",
         "Fit the model of an experiment to its recordings and critical loads, all together, by maximum likelihood.",
@@ -60,7 +64,7 @@ COMMANDS = {
         "Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding.",
     ),
     "prove": ("srfcli.cli.prove:command", "Prove the diagnosis on experiments whose truth nobody has seen."),
-    "config": ("srfcli.cli.system:config", "Show which values are used, and who set them."),
+    "config": ("srfcli.cli.system:config", "Show which values are used, and where each comes from."),
 }
 
 EPILOG = """
@@ -73,8 +77,8 @@ srf config show                                   every parameter and where its 
 
 A value is taken from a flag, else SRF_NAME, else srf.toml, else the law's default.
 Units are um, s, N and kg unless written: --K '210 N/mm'.
-Exit codes: 0 done, 1 unexpected or I/O, 2 usage or a bad law, 3 did not converge,
-4 a --fail-on condition was true, 130 interrupted.
+Exit codes: 0 done, 1 unexpected or I/O, 2 wrong usage, or an invalid law, experiment or data file,
+3 did not converge, 4 a --fail-on condition was true, 130 interrupted.
 """
 
 

@@ -213,7 +213,7 @@ COMPARED_OPTIONS: options.Options = {  # those of `system_options`, but that sev
 @click.command("compare", cls=SrfCommand, epilog=COMPARE)
 @options.add_options(COMPARED_OPTIONS)
 @options.values_option(options.AMPLITUDE, default=(0.18,))
-@click.option("--at", default="10", metavar="V", help="Velocity (um/s) at which laws are brought together.")
+@click.option("--at", default="10", metavar="V", help="Velocity (um/s) at which the laws are matched.")
 @click.option("--adjust", default="A,B,D0", help="The three parameters adjusted, with mu0 where there is one.")
 @click.option("--match/--no-match", "matched", default=True, help="Whether parameters are adjusted at all.")
 @options.over_option(help="The window: V=LOW:HIGH[:POINTS] and K/W0=LOW:HIGH[:POINTS], each of which may be left out.")
@@ -231,7 +231,8 @@ def compare(
     output: options.OutputOptions,
     **system: Any,
 ) -> None:
-    """Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment tells them apart.
+    """Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment discriminates
+    between them.
 
     The first law is the reference. Every other one is brought to its friction, slope, critical load and critical period at one
     low velocity, so that what differs is the law and not its calibration.

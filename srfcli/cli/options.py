@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
 DEFAULT_POINTS = 60
 MAX_POINTS = 1_000_000
+CONFIGURED = "[default: as `srf config show` prints]"  # of a parameter's option
 AXIS_FORM = "Write NAME=LOW:HIGH:POINTS[:log|lin] or NAME=a,b,c, as in V=1:100:60, V=1,2,5 or 'V=1:100 um/s:60'."
 
 
@@ -195,21 +196,23 @@ def over_option(*, help: str, default: Sequence[str] = ()) -> Callable[[Callable
 
 
 def values_option(
-    parameter: Parameter, *, default: tuple[float, ...] | None = None, about: str = ""
+    parameter: Parameter, *, default: tuple[float, ...] | None = None, about: str = "", configured: bool = True
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add --NAME for a list of values, `--V 1,7,25` or repeated, with or without unit.
 
     The command gets `NAME`, a tuple of floats in the declared unit, checked against the bounds, or None if neither
-    the option nor a `default` was given. Text and unit of the help come from `parameter`.
+    the option nor a `default` was given. Text and unit of the help come from `parameter`. If `configured`, the help says that
+    the value of `srf config show` is taken in place of None.
     """
     unit = "" if parameter.unit == "1" else f", in {parameter.unit}"
     meaning = about or parameter.about or parameter.name
+    otherwise = f"  {CONFIGURED}" if configured and default is None else ""
     return click.option(
         f"--{parameter.name}",
         parameter.name,
         multiple=True,
         metavar="VALUES",
-        help=f"{meaning[:1].upper()}{meaning[1:]}{unit}; several as a,b,c.",
+        help=f"{meaning[:1].upper()}{meaning[1:]}{unit}; several as a,b,c.{otherwise}",
         callback=lambda _context, _option, texts: parse_values(texts, parameter) if texts else default,
     )
 
@@ -358,7 +361,10 @@ def _about(key: str) -> str:
 Options = dict[str, Callable[[Any], Any]]  # decorators by the name of the argument that each of them adds
 APPARATUS_OPTIONS: Options = {
     "inertia": click.option("--inertia/--no-inertia", default=None, help="Whether the slider's mass counts.  [default: it does]"),
-    **{f"set_{n}": click.option(f"--{n}", f"set_{n}", metavar="VALUE", help=about) for n, about in APPARATUS_FLAGS.items()},
+    **{
+        f"set_{n}": click.option(f"--{n}", f"set_{n}", metavar="VALUE", help=f"{about}  {CONFIGURED}")
+        for n, about in APPARATUS_FLAGS.items()
+    },
 }
 SYSTEM_OPTIONS: Options = {
     "law": click.option("--law", metavar="NAME", help=_about("law"), shell_complete=names_of("friction")),
@@ -448,7 +454,7 @@ plugins_option = click.option(
 
 def value_option(name: str, help: str) -> Callable[[F], F]:
     """Add --NAME for one value of a parameter, as text with or without unit."""
-    return click.option(f"--{name}", name, metavar="VALUE", help=help)
+    return click.option(f"--{name}", name, metavar="VALUE", help=f"{help}  {CONFIGURED}")
 
 
 def mesh_option(*, least: int, most: int = 8192, default: int = 512) -> Callable[[F], F]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from srfcli.validation.trials import Trial
 
 EXAMPLES = """
-srf prove --out proof                                      ten cases: a first look, half an hour
+srf prove --out proof                                      ten cases: a first look, some twenty minutes
 srf prove --cases 200 --seed 4 --workers 0 --out proof     two hundred cases on all cores
 srf prove --out proof --resume                             go on with what was interrupted
 srf prove --cases 40 --kind none --out nulls               false alarms alone

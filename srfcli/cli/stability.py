@@ -62,7 +62,9 @@ VELOCITY = Parameter("V", 10.0, "um/s", 1e-12, 1e9, "driving velocities")
 @options.options_with_effects
 @options.values_option(VELOCITY)
 @options.values_option(options.AMPLITUDE)
-@click.option("--window", metavar="LOW:HIGH", help="Loads to look between, in N; else all at which a crossing can be.")
+@click.option(
+    "--window", metavar="LOW:HIGH", help="Range of loads to search, in N.  [default: all loads at which a crossing can occur]"
+)
 @click.option("--tol", type=float, help="Relative error of a critical load.", default=1e-8)
 @click.option("--samples", type=click.IntRange(8, 100_000), default=192, help="Loads looked at first, on each line.")
 @click.option("--resolution", default=1e-3, help="Finest spacing in ln W0 where a pair of crossings could hide.")
@@ -117,7 +119,7 @@ srf response --V 10 --W0 6 --mean --eps 0.05,0.1,0.2 --over f=20:400:30
 @options.options_with_effects
 @options.value_option("V", "Driving velocity in um/s.")
 @options.value_option("W0", "Mean normal load in N.")
-@options.values_option(options.AMPLITUDE, about="relative modulation amplitudes, for --mean")
+@options.values_option(options.AMPLITUDE, about="relative modulation amplitudes, for --mean", configured=False)
 @options.over_option(
     default=("f=1:1000:200",), help="The frequencies (Hz), or another parameter: NAME=LOW:HIGH[:POINTS[:log|lin]]."
 )
@@ -137,7 +139,7 @@ def response(
     """How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t).
 
     To first order in eps: gain and phase of friction, position and slip velocity, and where they resonate. With --mean:
-    what the modulation takes off the mean friction force, at any amplitude.
+    the reduction of the mean friction force by the modulation, at any amplitude.
     """
     from srfcli.tasks import stability
 

@@ -28,7 +28,7 @@ COLUMNS = (
 
 @click.group("config", cls=SrfGroup)
 def config() -> None:
-    """Show which values are used, and who set them."""
+    """Show which values are used, and where each comes from."""
 
 
 @config.command(

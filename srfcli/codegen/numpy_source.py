@@ -250,8 +250,6 @@ def _write_statics(writer: Writer, eq: Equations, linear: Linearisation) -> None
     at_rest = dict(zip(eq.unknowns, eq.steady, strict=True)) | {symbol("W"): symbol("W0")}
     doc = "Friction coefficient in steady sliding at V."
     writer.scalar("steady_friction", doc, eq.mu.subs(at_rest), state=False)
-    doc = "d mu/d ln v, then d mu/d ln phi for each state, in steady sliding."
-    writer.vector("slopes", doc, [linear.mu_v, *linear.mu_phi], state=False)
     doc = "Real coefficients a_0..a_n of the characteristic polynomial in s."
     writer.vector("characteristic", doc, linear.characteristic, state=False)
     if linear.hurwitz is not None:
@@ -266,12 +264,6 @@ def _write_statics_by_rates(writer: Writer, eq: Equations) -> None:
     mu = eq.mu.subs(symbol("W"), eq.load)
     doc = "Friction coefficient in steady sliding at V."
     writer.scalar("steady_friction", doc, mu.subs(at_rest), state=False)
-    v, V, rest = symbol("v"), symbol("V"), eq.names.index("ln_v") + 1
-    slopes = [(v * sp.diff(mu, v)).subs(at_rest)]
-    for s, value in zip(eq.unknowns[rest:], eq.steady[rest:], strict=True):
-        slopes.append(-sp.diff(mu, s).subs(at_rest) * V * sp.diff(value, V))
-    doc = "d mu/d ln v, then what each other state takes from d mu/d ln V, in steady sliding."
-    writer.vector("slopes", doc, slopes, state=False)
     writer.parts.append(_CHARACTERISTIC.format(V=writer.parameters.index("V"), W0=writer.parameters.index("W0")))
 
 
@@ -368,6 +360,8 @@ def _write_cycle(writer: Writer, eq: Equations) -> None:
     writer.scalar("cycle_friction", "Friction coefficient.", mu.subs(load), head=head)
     writer.scalar("cycle_load", "Normal load W.", eq.load.subs(load), head=head)
     writer.scalar("cycle_elongation", "Spring elongation u.", eq.spring.subs(load), head=head)
+    if eq.drive != symbol("V"):
+        writer.scalar("cycle_drive", "Velocity at which the spring is pulled.", eq.drive.subs(load), head=head)
     w, a = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "wa")
     entries = {(i, j): jacobian.outputs[len(n) * i + j] for i in n for j in n}
     form = jacobian.with_outputs([sum((w[i] * entries[i, j] * a[j] for i in n for j in n), sp.S.Zero)])

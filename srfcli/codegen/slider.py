@@ -32,7 +32,7 @@ class SlidingSystem:
         Functions of arrays, in um, s, N: those of steady sliding and of a modulation that lasts. Raises SrfError for an effect
         that neither depends on.
     motion : GeneratedModel
-        The same for motion in time, under any drive and load. Another one where there are effects.
+        The same for motion in time, under any drive and load. Differs from `model` if the system has effects.
     """
 
     resolved: Resolved = field(repr=False)
@@ -97,7 +97,7 @@ def system(
 ) -> SlidingSystem:
     """Return a slider with these laws and parameters.
 
-    Settings files and environment variables do not count: what a script says is what it computes.
+    Parameter values are not read from settings files or environment variables.
 
     Parameters
     ----------

@@ -120,12 +120,15 @@ class Notice:
 
 
 class Status(Enum):
-    """How a numerical result ended; `advice` is a sentence with a way out."""
+    """How a computation ended; `advice` says what to try next."""
 
     advice: str
 
     OK = "ok", "Converged."
-    NO_CONVERGENCE = "no-convergence", "Newton's method did not converge; start nearer, or raise `max_mesh` or lower eps first."
+    NO_CONVERGENCE = (
+        "no-convergence",
+        "Newton's method did not converge. Start nearer to the solution, raise `max_mesh`, or lower eps.",
+    )
     TOLERANCE = "tolerance-not-met", "The estimated error is above the tolerance on the finest mesh allowed; raise `max_mesh`."
     MAX_STEPS = "max-steps", "The curve was cut at the step limit; raise `max_steps`."
     STEP_TOO_SMALL = "step-too-small", "The step along the curve fell below its minimum; a singular point is near."
@@ -140,9 +143,9 @@ class Status(Enum):
         "integration-stopped",
         "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
     )
-    NO_VALUE = "no-value", "A formula has no value where a parameter is 0 or at the end of its range; leave that out."
+    NO_VALUE = "no-value", "A formula is undefined at these parameters, for example where one is 0; exclude that value."
     EVALUATIONS = "max-evaluations", "The fit was cut at its limit of evaluations; raise `max_evaluations`, or start nearer."
-    INTERRUPTED = "interrupted", "what was finished is kept."
+    INTERRUPTED = "interrupted", "What was finished is kept."
 
     def __new__(cls, value: str, advice: str = "") -> Status:
         """Return the member of this value, with its advice."""

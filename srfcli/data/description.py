@@ -541,7 +541,8 @@ def open_node(path: Path) -> Node:
         if path.suffix.lower() != ".toml":
             raise SrfError(
                 f"{path}: a data file, not the description of an experiment",
-                f"`srf new {path}` writes an experiment.toml for it.",
+                f"For a recording, `srf new {path}` writes an experiment.toml. A table of critical loads goes under "
+                f"[[thresholds]] in an experiment.toml, or to `srf fit {path}`.",
             ) from None
         raise SrfError(error.message, error.hint or 'Text goes in quotes: law = "srf-vsat".') from None
     return Node(path, table, (), key_lines(text))

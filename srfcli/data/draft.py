@@ -89,6 +89,7 @@ FORCE_OF_STRESS = {stress: force for force, stress in STRESSES.items()}
 OBSERVED = ("elongation", "force", "shear_stress", "friction")
 NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
 HOLD_SPEED = 0.05  # of the slowest sliding, below which is a hold
+UNLIKE_START = 0.2  # of the usual friction: a record whose first readings are farther from it does not begin in steady sliding
 SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps; with as many steps it has many
 STEP_BY_STEP = (  # what a run with many steps may need
     '# vary = ["mu0"]   # take the # away for a friction level of each step\'s own; "noise": a gauge noise of its own, too',
@@ -263,12 +264,14 @@ def _wished(role: str, text: str, headings: Sequence[str], path: Path, geometry:
 def _spelled(heading: str) -> tuple[str, str | None]:
     """Return a heading's name in small letters and its unit, from brackets or a suffix; None where it has none."""
     name, unit = split_heading(heading)
-    plain = re.sub(r"[^a-z0-9/]+", "_", name.strip().lower()).strip("_")
+    latin = re.sub("[\u00b5\u03bc]", "mu", re.sub("[\u00b5\u03bc](?=[a-z])", "u", name.strip().lower()))  # um, and mu alone
+    plain = re.sub(r"[^a-z0-9/]+", "_", latin).strip("_")
     if unit is not None or any(plain in names for names in NAMED.values()):  # the n of sigma_n is no newton
         return plain.replace("/", "_"), unit
     for suffix in sorted(UNIT_SUFFIXES, key=len, reverse=True):
         if plain.endswith("_" + suffix):
-            return plain.removesuffix("_" + suffix), UNIT_SUFFIXES[suffix]
+            rest, factor = plain.removesuffix("_" + suffix), re.search(r"10\^\S+(?= )", latin)
+            return rest, f"{factor[0]} {suffix}" if factor else UNIT_SUFFIXES[suffix]  # which is refused: no unit has a factor
     return plain.replace("/", "_"), None
 
 
@@ -369,8 +372,11 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     remarks.append(f"kind of experiment: {kind}, {why}")
     if still := [name for name in sketch.free if name not in sketch.strokes]:
         remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(still)}")
+    begun = _begun([run for run in runs if run.name not in sketch.strokes], modulations)
+    remarks += [f"the initial state of {name} is estimated, as {reason}" for name, reason in begun.items()]
     sketch = replace(
-        sketch, kind=kind, why=why, several=kind == "steps" and any(len(_slid(run)) > SEVERAL for run in runs),
+        sketch, kind=kind, why=why, free=(*sketch.free, *begun),
+        several=kind == "steps" and any(len(_slid(run)) > SEVERAL for run in runs),
         modulations=modulations if kind == "oscillation" else {},
         durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
     )  # fmt: skip
@@ -538,10 +544,27 @@ def _kind(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, flo
         sliding = NO_SLIDING * float(V.max()) < V
         held = HOLD_SPEED * float(V[sliding].min()) > V
         if held[int(np.argmax(sliding)) :].any() and _levels(V[sliding]) < SEVERAL:
-            return "shs", f"as the drive of {run.name} holds for {float(np.mean(held)):.0%} of the time"
+            share = float(np.average(held[:-1], weights=np.diff(run.t)))
+            return "shs", f"as the drive of {run.name} holds for {share:.0%} of the time"
     ranges = [np.abs(run.drive(run.t)) for run in runs]
     low, high = min(float(V.min()) for V in ranges), max(float(V.max()) for V in ranges)
     return ("steps", f"as the drive goes from {low:.3g} to {high:.3g} um/s" if high > 1.001 * low else f"at {low:.3g} um/s")
+
+
+def _begun(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, float]]) -> dict[str, str]:
+    """Return the runs that do not begin in steady sliding although the drive moves, with what tells it."""
+    found = {}
+    for run in runs:
+        if run.initial != "steady":
+            continue
+        if run.name in modulations and modulations[run.name][2] <= run.t[0]:
+            found[run.name] = "its load oscillates from the first sample on"
+            continue
+        mu = (run.observed * run.friction_factor(run.load(run.t)[0]))[run.used]
+        first, usual = float(np.median(mu[:5])), float(np.median(mu))
+        if abs(first - usual) > UNLIKE_START * abs(usual):
+            found[run.name] = f"its friction begins at {first / usual:.0%} of its usual value"
+    return found
 
 
 def _levels(V: np.ndarray) -> int:

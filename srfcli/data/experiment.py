@@ -282,6 +282,13 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
     at_start = load.rest(float(t[0]))
     stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
     rise = np.abs(drive(t)) * per_elongation(role, stiffness, at_start)
+    if units.pop("the stiffness", None) not in (None, *units.values()) and units:
+        raise SrfError(
+            f"{run.node.where}: the stiffness is in {apparatus.stated}, and {', '.join(units)} "
+            f"{'is' if len(units) == 1 else 'are'} in units of {'stress' if any(units.values()) else 'force'}",
+            'Say the area of the contact, area = "25 cm^2" under [apparatus] or --area of `srf new`, '
+            f"or give the stiffness in {'MPa/mm' if any(units.values()) else 'N/um'}.",
+        )
     if len(set(units.values())) > 1:
         named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())
         notices.append(Notice("unit", run.file.name, f"{named}: a stress counts as the force on 1 mm^2"))

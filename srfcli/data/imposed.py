@@ -161,7 +161,7 @@ def _piece(t: Array, V: Array, sigma: Array, penalty: float) -> tuple[float, flo
     spread = float((w * (t - middle) ** 2).sum())
     slope = float((w * (t - middle) * (V - mean)).sum()) / spread
     if slope**2 * spread < penalty / 3:
-        return mean, 0.0
+        return (mean if mean**2 * float(w.sum()) > penalty / 3 else 0.0), 0.0  # a hold
     return mean + slope * (float(t[0]) - middle), slope
 
 
@@ -262,7 +262,7 @@ def _turns(x: Array, least: float) -> list[int]:
 
 # Straight pieces in a noisy record, as many as the record supports and no more (Bayesian information criterion).
 
-FEWEST_OF_PIECE = 5  # samples of a piece
+FEWEST_OF_PIECE = 5  # samples of a piece, or as many usual sampling intervals where samples are rare
 CORNER_ROUNDS = 40  # of the search for the places of the corners
 STRETCH = 128  # samples over which noise has its colour
 BURST = STRETCH  # samples of a burst of noise, at most
@@ -272,7 +272,7 @@ AROUND = 15  # neighbouring stretches from which the noise of one is estimated
 NOISE_SAMPLES = 101  # samples that share a level of white noise
 CLEAR = 8.0  # standard deviations about the lines beside it that a level jump exceeds
 SAMPLES_BESIDE = 200  # samples on each side by which a jump is told from a corner
-EVEN = 1e-5  # of the largest noise, at least: smaller ones would be lost in the rounding of the running sums
+EVEN = 1e-5  # of the largest noise, at least: with smaller ones the rest would be lost in rounding
 LEAST_NOISE = 1e-100  # um or um/s: a noise whose square is still a number
 UNEXPLAINED = 30.0  # times its noise that a displacement differs from the line, from where that is told
 WOBBLE = 0.02  # relative change of slope below which there is no corner
@@ -309,31 +309,40 @@ def split(t: Array, x: Array, sigma: Array, penalty: float) -> list[int]:
 
     A piece is split where that lowers the weighted sum of squares by more than `penalty`.
     """
-    w = 1.0 / np.maximum(sigma, EVEN * float(sigma.max())) ** 2
-    t, x = t - t[0], x - x[0]
-    # running sums, from which the misfit of any piece follows at once
-    sums = [np.concatenate([[0.0], np.cumsum(c)]) for c in (w, w * t, w * t * t, w * x, w * t * x, w * x * x)]
-
-    def misfit(a: NDArray[np.int64] | int, b: NDArray[np.int64] | int) -> Array:
-        """Return the weighted sum of squares about the best line through samples a to b - 1."""
-        w, wt, wtt, wx, wtx, wxx = (s[b] - s[a] for s in sums)
-        total, spread, cross = wxx - wx * wx / w, wtt - wt * wt / w, wtx - wt * wx / w
-        total = total - np.divide(cross * cross, spread, out=np.zeros_like(total), where=spread > 0)
-        return np.asarray(np.maximum(total, 0.0))
-
+    interval = float(np.median(np.diff(t)))
+    ends = np.append(t, t[-1] + interval)
     found: list[int] = []
     waiting = [(0, t.size)]
     while waiting:
         a, b = waiting.pop()
-        if b - a < 2 * FEWEST_OF_PIECE:
+        places = np.arange(a + 2, b - 1)
+        least = (FEWEST_OF_PIECE - 0.01) * interval
+        places = places[(t[places] - t[a] > least) & (ends[b] - t[places] > least)]
+        if places.size == 0:
             continue
-        places = np.arange(a + FEWEST_OF_PIECE, b - FEWEST_OF_PIECE + 1)
-        gain = misfit(a, b) - misfit(a, places) - misfit(places, b)
+        gain = _split_gain(t[a:b], x[a:b], sigma[a:b], places - a)
         if gain.max() > penalty:
             place = int(places[np.argmax(gain)])
             found.append(place)
             waiting += [(a, place), (place, b)]
     return sorted(found)
+
+
+def _split_gain(t: Array, x: Array, sigma: Array, places: NDArray[np.int64]) -> Array:
+    """Return by how much the weighted sum of squares about a line falls where another line begins at each of the `places`."""
+    w = 1.0 / sigma**2
+    s = t - np.average(t, weights=w)
+    rest = x - np.average(x, weights=w)
+    rest = rest - s * (np.sum(w * s * rest) / np.sum(w * s * s))  # of what is left, running sums lose no figures
+    sums = [np.concatenate([[0.0], np.cumsum(c)]) for c in (w, w * s, w * s * s, w * rest, w * s * rest)]
+
+    def explained(part: Sequence[Array]) -> Array:
+        """Return what the best line through a part takes off its sum of squares."""
+        w, ws, wss, wx, wsx = part
+        spread, cross = wss - ws * ws / w, wsx - ws * wx / w
+        return np.asarray(wx * wx / w + np.divide(cross * cross, spread, out=np.zeros_like(cross), where=spread > 0))
+
+    return explained([c[places] for c in sums]) + explained([c[-1] - c[places] for c in sums])
 
 
 def coloured_noise(t: Array, x: Array, sigma: Array, step: float) -> Array:
@@ -360,7 +369,8 @@ def coloured_noise(t: Array, x: Array, sigma: Array, step: float) -> Array:
     else:
         near = np.full(found.size, np.median(found))
     stretch = np.minimum(np.arange(x.size) // length, near.size - 1)
-    return np.asarray(sigma * np.sqrt(np.maximum(near[stretch], 1.0)))
+    whole = sigma * np.sqrt(np.maximum(near[stretch], 1.0))
+    return np.asarray(np.maximum(whole, EVEN * float(whole.max())))
 
 
 def _without_corners(t: Array, x: Array, step: float) -> Array:
@@ -477,8 +487,11 @@ def _jumps(t: Array, x: Array, sigma: Array, breaks: list[int], penalty: float) 
 
 
 def _places(t: Array, x: Array, breaks: list[int]) -> Array:
-    """Return where neighbouring lines meet, or the break itself where they meet elsewhere."""
-    edges = [0, *breaks, t.size]
+    """Return where neighbouring lines meet, or the break itself where they meet elsewhere.
+
+    Both ends of a gap in which they do not meet: a hold may be logged by its ends alone.
+    """
+    edges, usual = [0, *breaks, t.size], float(np.median(np.diff(t)))
     lines = [np.polyfit(t[a:b] - t[a], x[a:b], 1) for a, b in pairwise(edges)]
     found: list[float] = []
     for k, at in enumerate(breaks):
@@ -486,6 +499,9 @@ def _places(t: Array, x: Array, breaks: list[int]) -> Array:
         level = c0 + s0 * (t[edges[k + 1]] - t[edges[k]])
         meet = t[at] + ((level - c1) / (s1 - s0) if s1 != s0 else 0.0)
         low, high = (found[-1] if found else t[0]), t[edges[k + 2] - 1]
+        if t[at] - t[at - 1] > FEWEST_OF_PIECE * usual and not t[at - 1] <= meet <= t[at]:
+            found += [float(t[at - 1]), float(t[at])]
+            continue
         found.append(float(meet if low < meet < high else t[at]))
     return np.unique(found)
 
@@ -507,14 +523,14 @@ def _pruned(t: Array, x: Array, sigma: Array, knots: Array, penalty: float) -> A
 def _cost_without(t: Array, x: Array, sigma: Array, knots: Array, k: int) -> float:
     """Return by how much the misfit rises without knot k, judged by the samples of the two pieces on each side of it.
 
-    It is 0 where the slope hardly changes at the knot, or a piece beside it holds fewer than five samples.
+    It is 0 where the slope hardly changes at the knot, or a piece beside it is shorter than five usual sampling intervals.
     """
     low, high = max(k - 2, 0), min(k + 2, knots.size - 1)
     a, b = np.searchsorted(t, [knots[low], knots[high]])
     near = slice(int(a), max(int(b) + 1, int(a) + 2))
     kept = knots[low : high + 1]
-    inside = np.diff(np.searchsorted(t, knots[k - 1 : k + 2]))
-    if inside.min() < FEWEST_OF_PIECE:
+    few = np.diff(np.searchsorted(t, knots[k - 1 : k + 2])) < FEWEST_OF_PIECE
+    if np.any(few & (np.diff(knots[k - 1 : k + 2]) < FEWEST_OF_PIECE * np.median(np.diff(t)))):
         return 0.0
     slopes = np.diff(_heights(t[near], x[near], sigma[near], kept)) / np.diff(kept)
     before, after = slopes[k - low - 1], slopes[k - low]
@@ -541,12 +557,14 @@ def _heights(t: Array, x: Array, sigma: Array, knots: Array) -> Array:
     band[1, :-1] += total((1 - share) ** 2)
     band[1, 1:] += total(share**2)
     band[0, 1:] = total(share * (1 - share))
-    band[1] += 1e-9 * max(float(band[1].max()), 1e-300)  # a piece may lie between two samples
     level = float(x.mean())
     right = np.zeros(knots.size)
     right[:-1] += total((1 - share) * (x - level))
     right[1:] += total(share * (x - level))
-    return np.asarray(level + solveh_banded(band, right))
+    scale = np.sqrt(np.where(band[1] > 0, band[1], 1.0))  # a piece may lie between two samples, and weights differ by orders
+    band[0, 1:] /= scale[1:] * scale[:-1]
+    band[1] = 1 + 1e-12
+    return np.asarray(level + solveh_banded(band, right / scale) / scale)
 
 
 def _polished(t: Array, x: Array, sigma: Array, knots: Array) -> tuple[Array, Array]:

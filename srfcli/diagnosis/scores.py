@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
 
 import numpy as np
 
@@ -53,15 +52,6 @@ class Score:
     tolerance: float
     direction: Array = field(repr=False, compare=False)
     shifts: dict[str, float] = field(repr=False, compare=False, default_factory=dict)
-
-
-@dataclass(frozen=True)
-class PairScore:
-    """What two effects could explain together at first order, and the values expected of their parameters."""
-
-    effects: tuple[Effect, Effect]
-    gain: float
-    values: tuple[dict[str, float], dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -367,16 +357,14 @@ class Scores:
                 found.append(replace(c, columns=free[:, part], along=beside, taken=taken[:, part]))
         return found
 
-    def _judge(self, *several: _Column) -> tuple[float, Array, Array]:
-        """Return what columns gain together, their sizes, and the covariance of these."""
-        free = np.concatenate([c.columns for c in several], axis=1)
-        gram, g = free.T @ free, free.T @ self.remainder.left
+    def _judge(self, column: _Column) -> tuple[float, Array, Array]:
+        """Return what a column gains, its sizes, and the covariance of these."""
+        gram, g = column.columns.T @ column.columns, column.columns.T @ self.remainder.left
         plain = self._solved(gram, g)
-        if not self.shared.gain:
+        if column.along is None:
             return plain
-        along = np.concatenate([c.along for c in several if c.along is not None], axis=1)
-        kept = along * self.shared.absorbed[:, None]
-        beside = self._solved(gram - along.T @ kept, g - kept.T @ self.shared.left)
+        kept = column.along * self.shared.absorbed[:, None]
+        beside = self._solved(gram - column.along.T @ kept, g - kept.T @ self.shared.left)
         gain = max(plain[0] - self.shared.gain, beside[0])
         return (gain, *(beside if gain == beside[0] else plain)[1:])
 
@@ -431,22 +419,6 @@ class Scores:
         if size.size == 2:
             value, inner["phase"] = float(np.hypot(*size)), float(np.arctan2(size[1], size[0]))
         return inner | {column.name: float(np.clip(neutral_values(effect)[column.name] + value, low, high))}
-
-    def pairs(self, most: int) -> list[PairScore]:
-        """Return what any two of the foremost effects could explain together, largest gain first."""
-        chosen: dict[str, list[tuple[float, _Column]]] = {}
-        for column in self.columns:
-            chosen.setdefault(column.effect.reported, []).append((self._judge(column)[0], column))
-        foremost = [max(found, key=lambda f: f[0])[1] for found in chosen.values()]
-        found = []
-        for a, b in combinations(foremost, 2):
-            gain, size, _ = self._judge(a, b)
-            cut = a.columns.shape[1]
-            if not (self._possible(a, size[:cut]) and self._possible(b, size[cut:])):
-                continue
-            values = (self._expected(a, size[:cut]), self._expected(b, size[cut:]))
-            found.append(PairScore((a.effect, b.effect), gain, values))
-        return sorted(found, key=lambda p: -p.gain)[:most]
 
 
 def may_befall_one_run(effect: Effect) -> bool:

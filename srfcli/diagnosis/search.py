@@ -23,18 +23,18 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.goodness_of_fit import field_share, shortcomings, taken_up
+from srfcli.diagnosis.goodness_of_fit import shortcomings, taken_up
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
 from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
     DEVIATION,
     FIELD,
+    HOPELESS,
     NEEDED,
     NOT_CONVERGED,
     Likelihood,
     Maximum,
-    Point,
     Predictive,
     StateSpaceFit,
     correlated,
@@ -56,19 +56,14 @@ WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns ar
 CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
 MOST_EFFECTS = 2  # effects of a model
 ALIKE_EFFECTS = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
-SINGLES, PAIRS = 5, 3  # promises of each model that are followed
-UNDERSTATED = 2.0  # times the gain at first order that an effect may bring beside a model that is far off or has taken it up
-SHARED = 2.0  # in log evidence, what a field that all runs share costs: it is one of two kinds, and has an amplitude of its own
+MOST_FOLLOWED = 5  # promises of each model that are followed
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 SEARCH_RTOL = 1e-3  # tolerance of the integration: 0.02 in log likelihood
 BUDGET = 150.0  # s of CPU, or more
 BASELINES = 5.0  # times what the baseline took, if that is more: two effects, each fitted twice, and what they leave to be scored
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
-ASTRAY = 1000.0  # in log likelihood below its parent, from where a model is not fitted: its score knows nothing of the maximum
 LARGEST_SHIFT = 10.0  # in the logarithm of a parameter, that a score can move it: beyond any bounds
 BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
-RESIZED_BY = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
-AGAIN = 9  # of them, about the best, whose other parameters are fitted too where the model fails a test: 26 % apart
 STRIDES = 12  # steps of another ageing law from the file's own start values, or on from where it promises to be likelier
 HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
 FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
@@ -79,7 +74,7 @@ class Fitted:
     """A model fitted: log evidence, what speaks against it (nothing where it passes), what it leaves, what effects promise.
 
     `separate` is the log evidence where each run has a field of its own; of it `mass_at_bounds` comes from parameters at a bound.
-    `shared` is what a field that all runs share gains beyond SHARED at first order, None where an effect says what all runs share
+    `shared` is what a field that all runs share gains beyond NEEDED at first order, None where an effect says what all runs share
     along slip; `granted` is what is granted of that.
     """
 
@@ -134,7 +129,6 @@ class _Move:
     sizes: tuple[dict[str, float], ...] = field(compare=False)
     least: float = field(compare=False, default=-np.inf)  # log likelihood from which it is worth a fit
     fresh: int = field(compare=False, default=0)  # how many of the last effects are at sizes that are only expected
-    again: bool = field(compare=False, default=False)  # fitted before, from other sizes
     direction: Array | None = field(compare=False, default=None)  # of what its last effect is expected to explain
     shifts: Mapping[str, float] = field(compare=False, default_factory=dict)  # of other parameters that go with that
 
@@ -175,7 +169,7 @@ class ModelSearch:
         hypothesis = move.hypothesis if move else Hypothesis()
         options = {"processes": _colours(move.values) if move else None, "cautious": True, **self.options}
         if move:
-            options["least"] = self.baseline.fit.log_likelihood - ASTRAY
+            options["least"] = self.baseline.fit.log_likelihood - HOPELESS
 
         def fitted(values: dict[str, float] | None) -> StateSpaceFit:
             return self._state_space(self._problem(hypothesis, values or {}), start=values, beside=False, **options)
@@ -252,7 +246,7 @@ class ModelSearch:
         random = not by_slip and found.maximum.away < NOT_CONVERGED  # a track is a function of slip or a random one
         return Fitted(
             hypothesis, found, log_evidence(found, sizes) + self._prior(hypothesis), mass_at_bounds(found, sizes),
-            tuple(shortcomings(found)), remainder, max(remainder.shared.gain - SHARED, 0.0) if random else None,
+            tuple(shortcomings(found)), remainder, max(remainder.shared.gain - NEEDED, 0.0) if random else None,
         )  # fmt: skip
 
     def _prior(self, hypothesis: Hypothesis) -> float:
@@ -284,7 +278,7 @@ class ModelSearch:
         if not base.passes:
             self._try_ageing_laws(base)
         self._search()
-        for further in (self._expand_without_field, self._refit_noise, self._try_pairs):  # dearer, or less likely
+        for further in (self._expand_without_field, self._refit_noise):  # dearer, or less likely
             if not (self.best().passes or self.spent):
                 further(self.baseline)
                 self._search()
@@ -295,11 +289,7 @@ class ModelSearch:
             for again in (self._try_ageing_laws, self._refit_noise):
                 again(self.baseline)
                 self._search()
-        if not self.spent:
-            self._try_rivals()
-            self._search()
         self._where_effects_act()
-        self._refit_baseline()
         self._eliminate()
         simplest = self.best()
         self._search()  # a simpler model that is the best now was not asked yet what it lacks
@@ -314,7 +304,7 @@ class ModelSearch:
 
     def _fit_all(self) -> None:
         """Fit the baseline, and what comes close to the best, to all readings; the others were not."""
-        close = [f for f in self.ranked() if self.best().evidence - f.evidence < CLOSE][:SINGLES]
+        close = [f for f in self.ranked() if self.best().evidence - f.evidence < CLOSE][:MOST_FOLLOWED]
         parts = {f.name: f for f in (*close, self.baseline)}
         self.experiment, fitted = self.whole, {}
         options = {"processes": None, "cautious": True, **self.options}
@@ -378,8 +368,8 @@ class ModelSearch:
                 self._expect_elsewhere(move)
                 continue
             self._revise(move, found)
-            if found is self.best() and not found.passes and not move.again:
-                self._restart(found)
+            if found is self.best() and not found.passes:
+                self._scan(found)
 
     def _revise(self, move: _Move, found: Fitted) -> None:
         """Raise what is expected of effects that are like a fitted one at first order by what that gained beyond its promise."""
@@ -408,10 +398,8 @@ class ModelSearch:
         self.excluded += scores.excluded
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
-        least = WORTH if node.passes else WORTH / UNDERSTATED
-        if node.passes and (not node.fit.smooth or node.fit.likelihood.processes):  # what is random may have taken it up
-            least = -self._one_more if node.hypothesis.reported else HINT
-        self._promise(node, node, self._gains(scores), least)
+        random = not node.fit.smooth or node.fit.likelihood.processes  # may have taken up what is missing
+        self._promise(node, node, self._gains(scores), WORTH if node.passes and not random else HINT)
         for effect in (e for e in joining if e.settings or e.observed):
             self._try_built_in(node, effect)
         return node
@@ -433,7 +421,7 @@ class ModelSearch:
 
         Unless its field and gauge `noise` are kept, they are estimated anew.
         """
-        for gain, score in sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])[:SINGLES]:
+        for gain, score in sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])[:MOST_FOLLOWED]:
             hypothesis = Hypothesis((*node.hypothesis.effects, score.effect), node.hypothesis.ageing)
             sizes = (*self._sizes(at), score.values)
             own = {n: score.shifts[n] for n in at.fit.likelihood.problem.names if score.shifts.get(n)}
@@ -481,7 +469,7 @@ class ModelSearch:
     ) -> None:
         self.count += 1
         fresh = len(hypothesis.effects) - len(parent.hypothesis.effects)
-        least = parent.fit.log_likelihood - ASTRAY
+        least = parent.fit.log_likelihood - HOPELESS
         values = {n: v for n, v in parent.fit.values.items() if noise or not (n in FIELD or n.startswith("gauge_"))}
         move = _Move(
             -expected, self.count, hypothesis, values, sizes, least, fresh, direction=direction,
@@ -526,55 +514,17 @@ class ModelSearch:
             sizes = (*self._sizes(node), {own[0]: values[own[0]]})
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
 
-    def _restart(self, node: Fitted) -> None:
-        """Fit a model that fails a test anew where its fit may have ended in a false maximum.
-
-        At once from where a scan of a parameter leads, or another size of what is built in, if that is likelier. Else it is
-        pushed, to be fitted from where it stands, under a wider field, if a part of the recordings is off that neither the field
-        nor coloured noise has taken up.
-        """
-        best, found = node.fit.maximum, self._scanned(node) or self._resized(node)
-        if found is not None and not found.log_likelihood > node.fit.log_likelihood + NEEDED:
-            found = None
-        if found is None and (correlated(best.point) > DEVIATION or field_share(node.fit) > 1 or best.away > NOT_CONVERGED):
-            return
-        self.count += 1
-        values = dict((found or best.point).values)
-        sizes = self._sizes(node, values)
-        move = _Move(-(node.evidence + WORTH), self.count, node.hypothesis, values, sizes, again=True)
-        if found is None:
-            heapq.heappush(self.queue, move)
-            return
-        with contextlib.suppress(SrfError):  # else it stays as it was
-            self._record(self.fit(move))
-
-    def _scanned(self, node: Fitted) -> Point | None:
-        """Return the likeliest point that scans of parameters with narrow maxima lead to, None where it is no likelier."""
+    def _scan(self, node: Fitted) -> None:
+        """Fit a model that fails a test anew from where scans of parameters with narrow maxima lead, if that is likelier."""
         if not self.experiment.runs:
-            return None
-        problem, best = node.fit.likelihood.problem, node.fit.maximum.point
-        likelihood = Likelihood(problem, processes=node.fit.likelihood.processes, rtol=SEARCH_RTOL)
-        begun = likelihood.at(likelihood.coordinates(_followable(best.values, problem)))
+            return
+        likelihood = Likelihood(node.fit.likelihood.problem, processes=node.fit.likelihood.processes, rtol=SEARCH_RTOL)
+        begun = likelihood.at(likelihood.coordinates(_followable(node.fit.values, likelihood.problem)))
         found = scan_narrow(likelihood, begun, self.progress)
-        return found.point if found and found.point.log_likelihood > best.log_likelihood + NEEDED else None
-
-    def _resized(self, node: Fitted) -> Point | None:
-        """Return the likeliest point from other sizes of what is built in, the other parameters fitted under each.
-
-        So with the first of several inner parameters of an effect with states, as a frequency beside a damping; else None.
-        """
-        built = [n for e in node.hypothesis.effects if e.settings for n in (*(p.name for p in e.parameters), *e.frees)]
-        built += [e.scans[0][0] for e in node.hypothesis.effects if e.states and len(e.scans) > 1]
-        likelihood = node.fit.likelihood
-        name = next((n for n in likelihood.problem.names if n in built), None)
-        if name is None:
-            return None
-        trials, values = [], _followable(node.fit.values, likelihood.problem)
-        for ratio in np.geomspace(1 / RESIZED_BY, RESIZED_BY, AGAIN):
-            y = likelihood.coordinates({**values, name: values[name] * ratio})
-            trials.append(maximise(likelihood, y, held=[name], steps=STRIDES // 2, close=1.0, widths=(), progress=self.progress))
-        likeliest = max(trials, key=lambda f: f.point.log_likelihood)
-        return maximise(likelihood, likeliest.point.x, steps=STRIDES, close=1.0, widths=(), progress=self.progress).point
+        if found and found.point.log_likelihood > node.fit.log_likelihood + NEEDED:
+            values = dict(found.point.values)
+            with contextlib.suppress(SrfError):  # else it stays as it was
+                self._record(self.fit(_Move(0.0, 0, node.hypothesis, values, self._sizes(node, values))))
 
     def _refit_noise(self, base: Fitted) -> None:
         """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""
@@ -583,7 +533,7 @@ class ModelSearch:
             return
         processes = self._refitted(best, None).fit.likelihood.processes
         if processes != best.fit.likelihood.processes:
-            for node in {f.name: f for f in (base, *self.ranked()[:SINGLES])}.values():
+            for node in {f.name: f for f in (base, *self.ranked()[:MOST_FOLLOWED])}.values():
                 if node.fit.likelihood.processes != processes:
                     self._refitted(node, processes)
             self.queue.clear()
@@ -598,28 +548,6 @@ class ModelSearch:
         except SrfError:  # it stays as it was
             return node
 
-    def _try_pairs(self, node: Fitted) -> None:
-        """Push the pairs of effects that promise more together than the best alone."""
-        if node.scores is None or not node.promised:
-            return
-        for pair in node.scores.pairs(PAIRS):
-            if pair.gain > node.promised[0].gain + WORTH:
-                self._push(node.attainable + pair.gain + 2 * self._one_more, Hypothesis(pair.effects), node, pair.values)
-
-    def _try_rivals(self) -> None:
-        """Push what may do as well in the place of one effect of the best model: by UNDERSTATED times what it promised there."""
-        best = self.best()
-        effects, ageing = best.hypothesis.effects, best.hypothesis.ageing
-        rests = [Hypothesis(tuple(e for e in effects if e is not left_out), ageing) for left_out in effects]
-        rests += [Hypothesis(effects)] if ageing else []
-        for rest in rests if best.passes else ():
-            node = self.fitted.get(rest.name)
-            if node is None or node.scores is None:
-                continue
-            beside = [(gain, s, Hypothesis((*rest.effects, s.effect), rest.ageing)) for gain, s in self._gains(node.scores)]
-            rivals = [(UNDERSTATED * gain, s) for gain, s, hypothesis in beside if hypothesis.name not in self.fitted]
-            self._promise(node, node, rivals, WORTH)
-
     def _try_ageing_laws(self, node: Fitted, *, afresh: bool = False) -> None:
         """Push the other ageing laws, each after a few steps from where the model or the best one stands.
 
@@ -629,7 +557,7 @@ class ModelSearch:
         best = self.best()
         parents = (node,) if best is node else (node, best)
         stated, *modifiers = self.experiment.choice.ageing.split("+")
-        least = node.fit.log_likelihood + (WORTH if node.passes else -ASTRAY)  # log likelihood
+        least = node.fit.log_likelihood + (WORTH if node.passes else -HOPELESS)  # log likelihood
         reached: list[tuple[float, Hypothesis, Likelihood, Maximum]] = []
         for name in self.laws:
             hypothesis = Hypothesis((), "+".join([name, *modifiers]))
@@ -696,23 +624,6 @@ class ModelSearch:
             self._record(self.fit(_Move(0.0, 0, hypothesis, dict(node.fit.values), sizes)))
         except SrfError as error:
             self.excluded.append(Excluded(hypothesis.name, error.message))
-
-    def _refit_baseline(self) -> None:
-        """Fit the baseline anew from the best model's parameters where it is likelier than it was: it had a false maximum."""
-        best, base = self.best(), self.baseline
-        if best is base or not self.experiment.runs:
-            return
-        values = best.fit.values
-        own = best.fit.likelihood.beside(self._problem(Hypothesis(), values))
-        if not own.at(own.coordinates(values), slopes=False).log_likelihood > base.fit.log_likelihood + NEEDED:
-            return
-        try:
-            found = self._record(self.fit(_Move(0.0, 0, Hypothesis(), dict(values), ())))
-        except SrfError:  # it stays as it was
-            return
-        if found.fit is not base.fit:
-            self._expand(found)
-            self._search()
 
     def _eliminate(self) -> None:
         """Refit the best model, and what comes close, with fewer parts from its parameters (backward elimination).

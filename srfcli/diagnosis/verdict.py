@@ -14,9 +14,9 @@ from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import improbability, loudness, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, typical_sizes
 from srfcli.diagnosis.scores import Remainder, Score
-from srfcli.diagnosis.search import CLOSE, NEAR, SHARED, Fitted, ModelSearch
+from srfcli.diagnosis.search import CLOSE, NEAR, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.state_space import Filtered, Predictive, StateSpaceFit, maximise
+from srfcli.inference.state_space import NEEDED, Filtered, Predictive, StateSpaceFit, maximise
 
 BASELINE_VERDICTS = ("none", "inconclusive")  # verdicts whose final model is the baseline
 HELD_OUT_RMS = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
@@ -151,7 +151,8 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     return Diagnosis(
         whole, verdict, best, baseline, baseline if verdict in BASELINE_VERDICTS else shown, ranked, close,
         _confidence(ranked, joint, became, verdict), scores,
-        (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores}, _equivalent(scores, close), held,
+        (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores},
+        _equivalent(scores, close, ranked, joint), held,
         tuple(reasons), ungated, held_loads, became,
     )  # fmt: skip
 
@@ -203,7 +204,7 @@ def shared_gain(fitted: Fitted, whole: Experiment) -> float:
         if np.isfinite(fit.log_likelihood):
             every = replace(fit, maximum=replace(fit.maximum, point=fit.likelihood.at(fit.maximum.point.x)))
             fit.likelihood.best = None  # derivatives of all readings take much room
-            total += max(Remainder(every).shared.gain - SHARED - (fitted.shared or 0.0), 0.0)
+            total += max(Remainder(every).shared.gain - NEEDED - (fitted.shared or 0.0), 0.0)
     return total
 
 
@@ -325,15 +326,29 @@ def at_bounds(fitted: Fitted) -> list[str]:
     ]
 
 
-def _equivalent(scores: Sequence[Score], close: Sequence[Fitted]) -> tuple[tuple[str, ...], ...]:
-    """Return the pairs of effects whose signals no parameter change tells apart, and that matter here."""
+def _equivalent(
+    scores: Sequence[Score], close: Sequence[Fitted], ranked: Sequence[Fitted], joint: Mapping[str, float]
+) -> tuple[tuple[str, ...], ...]:
+    """Return the pairs of effects whose signals no parameter change tells apart, and that matter here.
+
+    First-order signals do not count where both were fitted and their log evidence tells them apart.
+    """
     names = {n for f in close for n in f.hypothesis.reported}
+    fitted = {frozenset(f.hypothesis.reported): joint[f.name] for f in reversed(ranked)}  # the best of each
+
+    def apart(one: str, other: str) -> bool:
+        for own in (set(f.hypothesis.reported) for f in close if one in f.hypothesis.reported):
+            if fitted[frozenset(own)] - fitted.get(frozenset(own - {one} | {other}), np.inf) > CLOSE:
+                return True
+        return False
+
     found = []
     for i, a in enumerate(scores):
         for b in scores[i + 1 :]:
-            told = {a.effect.reported, b.effect.reported}
-            if (told & names or not names) and abs(float(a.direction @ b.direction)) > ONE_CLASS:
-                found.append((a.effect.reported, b.effect.reported))
+            one, other = a.effect.reported, b.effect.reported
+            alike = ({one, other} & names or not names) and abs(float(a.direction @ b.direction)) > ONE_CLASS
+            if alike and not (apart(one, other) or apart(other, one)):
+                found.append((one, other))
     return tuple(found)
 
 

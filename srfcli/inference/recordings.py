@@ -16,7 +16,7 @@ from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment, Run
 from srfcli.inference.fit import BetweenGroups, Fit, Interrupted, Problem, fit_problem, scatter_of
 from srfcli.inference.shared_field import fit_shared
-from srfcli.inference.state_space import StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
+from srfcli.inference.state_space import NEEDED, StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
 from srfcli.laws.registry import Registry
 
 # The fit of an experiment's recordings as `srf fit` makes it: which likelihood, which starts, whose random friction field.
@@ -146,7 +146,7 @@ def fit_recordings(
         shared = fit_shared(replace(problem, model=tabled), best, progress=progress)
     except KeyboardInterrupt:
         return replace(result, status=Status.INTERRUPTED)
-    if track is None and shared.fit.log_likelihood < best.log_likelihood + SURELY:
+    if track is None and shared.fit.log_likelihood < best.log_likelihood + NEEDED:
         return result
     common = FittedField(shared.prior.amplitude, shared.prior.length, True) if shared.prior.amplitude else FittedField()
     return replace(result, fit=shared.fit, state_space=None, friction_field=common, status=shared.fit.status)
@@ -225,7 +225,6 @@ def fit_from_several(
 
 # Whether the runs slid on one and the same rough track.
 
-SURELY = 2.0  # in log likelihood, by which one track for all runs has to be likelier than one for each
 ALIKE_FIELDS = 0.5  # mean correlation of the fields of two runs from which one field for all is fitted
 
 

@@ -419,13 +419,20 @@ def _smoothing(x: Array, y: Array, noise: float) -> BSpline:
     places: list[int] = []
     index = 0
     while True:
-        ahead = min(index + SMOOTHING_BLOCK // 2, n - 1) // SMOOTHING_BLOCK
-        need = spacings[min(int(chosen[index // SMOOTHING_BLOCK]), int(chosen[ahead]))]
-        index += 4 * need if not places else need  # as at a not-a-knot end: more pieces there would follow the noise
+        k, pieces = int(chosen[index // SMOOTHING_BLOCK]), 1 if places else 4  # at an end, as of a not-a-knot spline: no fewer
+        while k and chosen[index // SMOOTHING_BLOCK : _block(index + pieces * spacings[k], n) + 1].min() < k:
+            k -= 1  # every block on the way to the next knot must allow it
+        need = spacings[k]
+        index += pieces * need
         if n - 1 - index < 4 * need:
             break
         places.append(index)
     return _least_squares(x, y, x[places])
+
+
+def _block(index: int, n: int) -> int:
+    """Return the block of the samples half a block beyond a sample of n."""
+    return min(index + SMOOTHING_BLOCK // 2, n - 1) // SMOOTHING_BLOCK
 
 
 def _spacings(misfit: Array, spacings: Array, samples: float, overall: int) -> NDArray[np.int64]:

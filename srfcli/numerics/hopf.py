@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel
 from srfcli.core.errors import Status
 
 WORST_RESIDUAL = 1e-9
@@ -59,9 +59,12 @@ def critical_point(model: GeneratedModel, p: Array) -> tuple[HopfPoint | None, S
 
 
 def weakening(model: GeneratedModel, p: Array) -> float:
-    """Return -d mu_ss / d ln V, positive for velocity weakening (states of the same steady age law)."""
-    slopes = model.slopes(p)
-    return float(slopes[..., 1:].sum(axis=-1) - slopes[..., 0])
+    """Return -d mu_ss / d ln V, positive for velocity weakening."""
+    V = model.index("V")
+    q = p.astype(complex)
+    q[V] *= 1 + 1j * COMPLEX_STEP
+    with np.errstate(all="ignore"):
+        return float(-model.steady_friction(q).imag / COMPLEX_STEP)
 
 
 def steady_is_stable(model: GeneratedModel, p: Array, W0: float) -> bool | None:
@@ -81,7 +84,8 @@ def closed_forms(model: GeneratedModel, p: Array) -> dict[str, float]:
     K, found = float(p[model.index("K")]), {}
     for name, key in (("limit_load", "K_over_W0_rigid"), ("quasistatic_load", "K_over_W0_quasistatic")):
         if name in model.namespace:
-            load = float(model.namespace[name](p))
+            with np.errstate(all="ignore"):
+                load = float(model.namespace[name](p))
             if np.isfinite(load) and load > 0:
                 found[key] = K / load
     if "closed_frequency" in model.namespace and weakening(model, p) > 0:

@@ -49,12 +49,15 @@ def linear_response(model: GeneratedModel, p: Array) -> LinearResponse:
     jacobian[~known], forcing[~known] = -np.eye(n), np.nan
     state = np.linalg.solve(2j * np.pi * np.eye(n) - jacobian, forcing[..., None])[..., 0]
     friction, load = (_observed(model, f"cycle_{name}", rest, p, state) for name in ("friction", "load"))
+    pulled: ComplexArray | float = 0.0
+    if "cycle_drive" in model.namespace:
+        pulled = _observed(model, "cycle_drive", rest, p, state) / (2j * np.pi * p[model.index("f")])
     mu, W, W0 = model.cycle_friction(0.0, rest, p), model.cycle_load(0.0, rest, p), p[model.index("W0")]
     return LinearResponse(
         p,
         friction,
         (friction * W + mu * load) / W0,
-        -_observed(model, "cycle_elongation", rest, p, state),  # x = Vt - u
+        pulled - _observed(model, "cycle_elongation", rest, p, state),  # of the spring's other end, and u
         state[..., model.states.index("ln_v")],
         known & (np.linalg.eigvals(jacobian).real.max(axis=-1) < 0),
         tuple(Status.OK if k else Status.NO_VALUE for k in np.atleast_1d(known)),

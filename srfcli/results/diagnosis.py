@@ -168,8 +168,7 @@ class DiagnosisResult(Result):
         notes = []
         if _differ(self.answer):
             notes.append("the baseline is fitted with the final model's field and gauge noise, to show what it lacks")
-        if self.verdict == "ambiguous":
-            notes += [f"{f.name}: {', '.join(self._added(f))}" for f in self.diagnosis.close]
+        notes += self._alternatives
         return Table("srf.diagnose.parameters/1", PARAMETERS, rows, "parameters", tuple(notes))
 
     @property
@@ -181,6 +180,12 @@ class DiagnosisResult(Result):
             for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
                 row[key] = row[key] and row[key] * factor
         return rows
+
+    @property
+    def _alternatives(self) -> list[str]:
+        """Return each model of an ambiguous verdict with the parameters that it has and the baseline has not, as text."""
+        close = self.diagnosis.close if self.verdict == "ambiguous" else ()
+        return [f"{f.name}: {', '.join(self._added(f))}" for f in close]
 
     def _added(self, fitted: Fitted) -> list[str]:
         """Return the parameters that a model has and the baseline has not, as text."""
@@ -218,7 +223,7 @@ class DiagnosisResult(Result):
             run = runs[shown["name"]]
             unit = f"  [{unit_text(run.unit)}]" if run.unit != "1" else ""
             shown |= {"label": f"{run.quantity}{unit}", "load_unit": run.load_unit}
-        made["parameters"] = self._parameters
+        made |= {"parameters": self._parameters, "alternatives": self._alternatives}
         stiffness, unit = experiment.shown_stiffness
         made["stated"] = {"stiffness": f"{stiffness:.4g} {unit_text(unit)}", "ageing": experiment.choice.ageing}
         made["laws"] = sorted({ranked.hypothesis.ageing for ranked in self.diagnosis.ranked} - {""})

@@ -343,6 +343,9 @@ def parameters(matter: Matter) -> Markup:
         told = joined([f"{name} by {number(size, 2)}" for size, name in sorted(bent, reverse=True)])
         parts.append(tag("p", f"To make up for what it lacks, the baseline had bent {told} standard errors."))
     parts.append(table(heads, rows, numeric=(1, 2, 3)))
+    if matter.material.get("alternatives"):
+        parts.append(tag("p", "The augmented model of the table is the first of those that do equally well:"))
+        parts.append(tag("ul", [tag("li", model) for model in matter.material["alternatives"]]))
     if not matter.same:
         parts.append(matter.figure("parameters", "Shift of each parameter between the two fits, in standard errors.",
                                    "Grey: two standard errors, what noise does.", small=True))  # fmt: skip
@@ -546,8 +549,9 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     ranked: {name, evidence, rms_over_noise, field, confidence, against};
     scores: {effect, gain, size, stderr, tolerance, detectable};
     parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma};
-    and, where there are any, discriminating: paragraphs on that run; force {run: {t, force, band (2, n), v, phi, W},
-    "form": text}; diagram {V, note, and for baseline and augmented model: W0, V of these, W0_hopf}.
+    and, where there are any, alternatives: each model of an ambiguous verdict, with its parameters, as text; discriminating:
+    paragraphs on that run; force {run: {t, force, band (2, n), v, phi, W}, "form": text}; diagram {V, note, and for baseline and
+    augmented model: W0, V of these, W0_hopf}.
     Without matplotlib the page has all but the figures, and says so.
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -212,8 +212,8 @@ class SimulationResult(Result):
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the records over time (s): one as panels above each other, several one to a row.
 
-        A recording, or a gauge's readings, are drawn behind the simulated observable. Velocities are on a logarithmic axis, on
-        which a drive that stands still has no place.
+        A recording, or a gauge's readings, are drawn behind the simulated observable. Velocities are on a logarithmic axis; a
+        drive at rest is not drawn.
         """
         own_figure(ax, "a simulation")
         alone = len(self.records) == 1

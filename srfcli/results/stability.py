@@ -381,7 +381,7 @@ class CriticalResult(Result):
     crossings : tuple of int
         The number of each at its velocity; stability is lost at odd ones as W0 rises, regained at even ones.
     said : tuple of str
-        Where was looked, and what was not found.
+        Notes: the loads that were searched, and crossings that were not found.
     worst : Status
         The worst status of lines and points.
     """

@@ -224,7 +224,7 @@ ROWS_SHOWN = 20  # rows of a table that a notebook shows
 
 
 class Result(ABC):
-    """What a task found; `table` holds its numbers, and all other forms are made of it."""
+    """Result of a task. `table` holds the numbers; data frames, arrays and figures are made from it."""
 
     @property
     @abstractmethod
@@ -233,7 +233,7 @@ class Result(ABC):
 
     @abstractmethod
     def plot(self, ax: Axes | None = None) -> Figure:
-        """Return a Matplotlib figure in the house style.
+        """Return a Matplotlib figure with the default style of srf.
 
         Parameters
         ----------

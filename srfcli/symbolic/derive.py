@@ -135,9 +135,13 @@ def abbreviated_polynomial(system: System) -> tuple[tuple[sp.Expr, ...], dict[sp
 
 
 def _abbreviate(slope: sp.Expr, name: str, back: dict[sp.Symbol, sp.Expr]) -> sp.Expr:
-    """Return `slope`, or a symbol for it where it is transcendental: algebra would only tear it apart."""
-    if not slope.has(sp.exp, sp.log, sp.LambertW) or slope.has(symbol("W0")):
+    """Return `slope`, or a symbol for it where it is transcendental or has roots: algebra would only tear it apart."""
+    torn = slope.has(sp.exp, sp.log, sp.LambertW) or any(not p.exp.is_Integer for p in slope.atoms(sp.Pow))
+    if not torn or slope.has(symbol("W0")):
         return slope
+    for known, value in back.items():
+        if value == slope:
+            return known
     stand_in = sp.Symbol(name, real=True)
     back[stand_in] = slope
     return stand_in

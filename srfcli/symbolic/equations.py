@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import numpy as np
 import sympy as sp
 from sympy.solvers.solveset import NonlinearError
 
 from srfcli.core.errors import SrfError
+from srfcli.core.units import to_base
 from srfcli.laws.expression import symbol
 from srfcli.laws.values import ExtraState
 from srfcli.symbolic.system import System, state_rate
 
 AUXILIARY = {"slip": "v", "stage": "V", "time": "1"}  # unknowns that an effect may name, um, um, s, and their rates
+CHECKED_VELOCITIES = tuple(10.0**k for k in range(-3, 4))  # um/s, at which steady states are checked
+CHECKED_LOAD = 10.0  # N, the same
 MAX_CANCEL = 80  # operations: beyond it a common denominator takes a minute to find and shortens nothing
 
 
@@ -23,7 +29,8 @@ class Equations:
     """x' = rates(x, t): `unknowns` are the symbols that stand in the formulas (v, not ln v), `logarithmic` says which.
 
     `load` is W as a function of the imposed load `W` and its rate `W_dot`; `spring` is the elongation u, an unknown or a formula;
-    `reading` is what the gauge shows of it, `shown` the same without what effects make of the gauge, `stiffness` the spring's.
+    `reading` is what the gauge shows of it, `shown` the same without what effects make of the gauge, `stiffness` the spring's;
+    `drive` is the velocity at which the spring is pulled.
     """
 
     names: tuple[str, ...]
@@ -34,6 +41,7 @@ class Equations:
     reading: sp.Expr
     shown: sp.Expr
     stiffness: sp.Expr
+    drive: sp.Expr
     load: sp.Expr
     mu: sp.Expr
     steady: tuple[sp.Expr, ...]
@@ -99,37 +107,77 @@ class lut2(sp.Function):
 
 
 @lru_cache(maxsize=32)
-def steady_states(system: System) -> tuple[sp.Expr, ...]:
-    """Return each state variable in steady sliding at velocity v, as a formula in v.
+def steady_states(system: System, load: sp.Expr | None = None) -> tuple[sp.Expr, ...]:
+    """Return each state variable in steady sliding at velocity v under `load`, W0 if left out, as a formula in v.
 
     Raises SrfError where no closed form is found; laws with phi = y D0/v, y a constant or a Lambert function, have one.
     """
-    still = {symbol(n): sp.S.Zero for n in ("mu_dot", "W_dot", "F_dot_over_W")}
-    rates = [(state_rate(system, s).subs(still), symbol(s.length), symbol(s.name)) for s in system.friction.states]
-    return tuple(_steady_state(*rate, system.ageing.name) for rate in rates)
+    values = {symbol(p.name): to_base(p.default, p.unit) for p in system.parameters}
+    load, found = symbol("W0") if load is None else load, []
+    for state in system.friction.states:
+        rate, length, phi = state_rate(system, state), symbol(state.length), symbol(state.name)
+        own = tuple((s, values[s]) for s in sorted(rate.free_symbols & set(values), key=str))
+        found.append(steady_age(rate, length, phi, system.ageing.name, own).subs(symbol("W"), load))
+    return tuple(found)
 
 
 @lru_cache(maxsize=32)  # systems that differ in what has no part in a rate have one in common
-def _steady_state(rate: sp.Expr, length: sp.Symbol, phi: sp.Symbol, name: str) -> sp.Expr:
+def steady_age(
+    rate: sp.Expr, length: sp.Symbol, phi: sp.Symbol, name: str, values: tuple[tuple[sp.Symbol, float], ...]
+) -> sp.Expr:
+    """Return the age at which a rate vanishes at constant load and velocity v, as a formula in v.
+
+    Of several that one which is positive and attracts at these values of the rate's parameters. Raises SrfError where there is
+    none, and where no closed form is found.
+    """
     v, y = symbol("v"), sp.Symbol("y", positive=True)
-    reduced = sp.expand_log(sp.simplify(rate.subs(phi, y * length / v)), force=True)
-    return _steady_root(reduced, y, name) * length / v
-
-
-def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
-    for guess in (sp.S.One, sp.S(2)):
-        if sp.simplify(reduced.subs(y, guess)) == 0:
-            return guess
-    try:
-        roots = [r for r in sp.solve(reduced, y) if not r.has(sp.I)] if _may_be_solved(reduced, y) else []
-    except (NotImplementedError, TypeError):  # the latter where sympy compares symbols on its way
-        roots = []
-    if not roots:
+    still = {symbol(n): sp.S.Zero for n in ("mu_dot", "W_dot", "F_dot_over_W")}
+    reduced = sp.expand_log(sp.simplify(rate.subs(still).subs(phi, y * length / v)), force=True)
+    if reduced.has(symbol("mu")):
         raise SrfError(
-            f"no closed form for the steady state of ageing law '{name}' was found",
-            "write the rate in terms of v*phi/D0 so that it vanishes at a constant, as 1 - v*phi/D0 does",
+            f"the steady state of ageing law '{name}' depends on mu, which depends on it: no closed form",
+            "write the rate so that mu stands in a factor that steady sliding does not need, or leave it out",
         )
-    return roots[0]
+    repelling = False
+    for root in _steady_roots(reduced, y):
+        if _attracts(reduced, y, root, dict(values)):
+            return root * length / v
+        repelling = True
+    if repelling:
+        raise SrfError(
+            f"ageing law '{name}' has no steady state that attracts at the default values of its parameters",
+            "write a rate that falls through 0 at a positive age",
+        )
+    raise SrfError(
+        f"no closed form for the steady state of ageing law '{name}' was found",
+        "write the rate in terms of v*phi/D0 so that it vanishes at a constant, as 1 - v*phi/D0 does",
+    )
+
+
+def _steady_roots(reduced: sp.Expr, y: sp.Symbol) -> Iterator[sp.Expr]:
+    """Yield where the reduced rate vanishes, in y = v phi/D0."""
+    yield from (guess for guess in (sp.S.One, sp.S(2)) if sp.simplify(reduced.subs(y, guess)) == 0)
+    with contextlib.suppress(NotImplementedError, TypeError):  # the latter where sympy compares symbols on its way
+        if _may_be_solved(reduced, y):
+            yield from (r for r in sp.solve(reduced, y) if not r.has(sp.I))
+
+
+def _attracts(reduced: sp.Expr, y: sp.Symbol, root: sp.Expr, values: Mapping[sp.Symbol, float]) -> bool:
+    """Return whether a root is positive and the rate falls there, at one velocity at least; True where that is not known."""
+    slope, known = sp.diff(reduced, y), False
+    for v in CHECKED_VELOCITIES:
+        at = {**values, symbol("v"): v, symbol("W"): CHECKED_LOAD}
+        try:
+            place = complex(root.subs(at))
+            falls = complex(slope.subs(y, root).subs(at))
+        except (TypeError, ValueError, ArithmeticError):
+            continue
+        if not np.isfinite([place, falls]).all():
+            continue
+        known = True
+        if place.real > 0 and abs(place.imag) <= 1e-9 * place.real and falls.real < 0:
+            return True
+    return not known
 
 
 def _may_be_solved(reduced: sp.Expr, y: sp.Symbol) -> bool:
@@ -270,7 +318,7 @@ class _Builder:
         )
         self.aux = auxiliary(system, self.parts, cyclic=cyclic)
         self.phis = [symbol(state.name) for state in system.friction.states]
-        self.steady = steady_states(system)
+        self.steady = steady_states(system, self.load_at_rest())
         self.mu, self.load, self.V = sp.Symbol("mu_"), sp.Symbol("load_"), sp.Symbol("V_")
         self.m_v, self.m_W, self.m_t = sp.symbols("mu_v_ mu_W_ mu_t_")
         self.m_phi = sp.symbols(f"mu_phi0:{len(self.phis)}")
@@ -328,6 +376,7 @@ class _Builder:
             reading=reading,
             shown=shown,
             stiffness=self.parts.K,
+            drive=self.parts.V if system.inertia else self.parts.V.subs(meaning),
             load=self.total_load(),
             mu=self.parts.mu,
             steady=tuple(steady),
@@ -367,11 +416,11 @@ class _Builder:
         return sp.S.One if name == "time" else symbol(AUXILIARY[name])
 
     def mu_ss(self) -> sp.Expr:
-        """Return the friction coefficient in steady sliding at V; under W0 where it depends on the load."""
+        """Return the friction coefficient in steady sliding at V under the load at rest."""
         s = symbol
         extra = {s(e.name): e.steady for e in self.extras}
         mu = self.parts.mu.subs(extra).subs(dict(zip(self.phis, self.steady, strict=True))).subs(s("v"), s("V"))
-        return mu.subs(s("W"), self.parts.W) if self.system.effects else mu
+        return mu.subs(s("W"), self.load_at_rest())
 
     def load_at_rest(self) -> sp.Expr:
         """Return the asperities' load in steady sliding; W0 itself where nothing changes it, as under inclined loading."""

@@ -60,7 +60,7 @@ def diagnose(
     plugins : sequence of path
         Folders in which laws are looked for, too.
     registry : Registry, optional
-        Laws and effects, where they are at hand already.
+        An open registry of laws and effects; loaded from `plugins` and the usual places if left out.
     progress : callable
         Told what is done, and which share of the search's budget is used where that is known.
 

@@ -24,12 +24,13 @@ from srfcli.laws.expression import expm1, log1p, symbol
 from srfcli.laws.law_file import COMMON, FORMULA, formula_of, kind_of
 from srfcli.laws.registry import Registry, bundled_registry
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, FrictionLaw, Interface, Law, State
+from srfcli.symbolic.equations import CHECKED_LOAD, CHECKED_VELOCITIES
+from srfcli.symbolic.equations import steady_age as age_formula
 from srfcli.symbolic.system import System, build_system, with_effects
 
 # What `srf law check` asks of a law: units, steady state, mu_v > 0, derivatives, worked values.
 
 REFERENCE_LAW = "srf-vsat"  # the friction law whose parameters stand in where an ageing law is checked by itself
-CHECKED_VELOCITIES = np.logspace(-3, 3, 7)  # um/s
 CHECKED_LOADS = np.logspace(-1, 3, 9)  # N
 DERIVATIVE_RTOL = 1e-9
 
@@ -57,7 +58,7 @@ def steady_age(rate: sympy.Expr, v: float, length: float, values: Values) -> flo
 
     Looked for between exp(-14) and exp(14) times length/v.
     """
-    still = {"mu": 0.5, "mu_dot": 0.0, "W": 10.0, "W_dot": 0.0, "F_dot_over_W": 0.0}
+    still = {"mu": 0.5, "mu_dot": 0.0, "W": CHECKED_LOAD, "W_dot": 0.0, "F_dot_over_W": 0.0}
 
     def at(y: Any) -> Any:
         return evaluate(rate, {**values, **still, "v": v, "phi": np.exp(y) * length / v}) + 0.0 * y
@@ -134,6 +135,16 @@ class _LawCheck:
             if phi is None:
                 raise SrfError(f"phi has no attracting steady value at v = {v:g} um/s", "The rate must fall through 0 at one.")
             found.append(phi * v / values["D0"])
+        own = tuple((symbol(p.name), values[p.name]) for p in self.parameters if symbol(p.name) in rate.free_symbols)
+        closed = age_formula(rate, symbol("D0"), symbol("phi"), law.name, own)
+        for v, y in zip(CHECKED_VELOCITIES, found, strict=True):
+            phi = y * values["D0"] / v
+            exact = float(evaluate(closed, {**values, "v": v, "W": CHECKED_LOAD}))
+            if not math.isclose(exact, phi, rel_tol=1e-6):
+                raise SrfError(
+                    f"phi may settle at {phi:.6g} and at {exact:.6g} s at v = {v:g} um/s",
+                    "Steady sliding must be one state: write a rate that falls through 0 once.",
+                )
         return f"phi v/D0 = {min(found):.6g} to {max(found):.6g} {velocities}"
 
     def steady_sliding(self) -> Iterator[tuple[str, float, Values]]:

@@ -42,7 +42,7 @@ def read_experiment(
     plugins : sequence of path
         Folders in which laws and readers are looked for, too.
     registry : Registry, optional
-        Laws and readers, where they are at hand already.
+        An open registry of laws and readers; loaded from `plugins` and the usual places if left out.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def check(
     plugins : sequence of path
         Folders in which laws are looked for, too.
     registry : Registry, optional
-        Laws, where they are at hand already.
+        An open registry of laws; loaded from `plugins` and the usual places if left out.
     progress : callable
         Told the name of each run before it is simulated.
 
@@ -176,12 +176,13 @@ def fit(
     trend : {'slip', 'time', 'none'}, optional
         Let each run's observable drift, or not; as the experiment says if left out.
     vary : str or sequence of str
-        Free parameters, or "noise" of the gauge, with a value of their own in each group of runs, B in a run up is B[up]; as
-        the experiment says if left out.
+        Free parameters, or "noise" of the gauge, with a value of their own in each group of runs. The value of B in the group
+        `up` is called `B[up]`. If left out, as the experiment says.
     by : {'run', 'load', 'segment', 'direction'}, optional
         What makes a group.
     prior : bool
-        Draw the values of five or more groups towards their mean, as far as they scatter by chance.
+        Give the values of five or more groups a Gaussian prior of estimated mean and standard deviation (empirical Bayes),
+        which shrinks them towards their mean.
     track : {'smooth', 'rough', 'shared'}, optional
         Random friction field along slip: none, one for each run, one for all; the recordings decide if left out.
     starts : int
@@ -195,7 +196,7 @@ def fit(
     plugins : sequence of path
         Folders in which laws are looked for, too.
     registry : Registry, optional
-        Laws, where they are at hand already.
+        An open registry of laws; loaded from `plugins` and the usual places if left out.
     progress : callable
         Told the stage (fit, profile, sample), what is done, and which share of the stage where that is known.
 
@@ -207,11 +208,13 @@ def fit(
     Raises
     ------
     SrfError
-        For what cannot be fitted.
+        For an experiment that cannot be read or has nothing to fit, a parameter without a start value or bounds, options that
+        do not go together, and for recordings without a C compiler.
 
     References
     ----------
-    Kalman (1960), J. Basic Eng. 82, 35: the filter. Vehtari and others (2021), Bayesian Analysis 16, 667: R-hat.
+    Kalman (1960), J. Basic Eng. 82, 35: the filter. Durbin and Koopman (2012), Time Series Analysis by State Space Methods: the
+    likelihood. Vehtari and others (2021), Bayesian Analysis 16, 667: R-hat.
 
     Examples
     --------
