@@ -187,7 +187,7 @@ def test_what_varies_is_checked_where_it_is_written(line, what, ladder, tmp_path
 def test_an_experiment_says_itself_what_a_fit_of_many_steps_needs(ladder, tmp_path, monkeypatch):
     """`srf new` writes what varies, by what, and the trend; with the # taken away the fit is that of the options."""
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(cli, ["new", str(ladder / "simulated.csv"), "--stiffness", "30 MPa/mm"])
+    done = CliRunner().invoke(cli, ["new", str(ladder / "simulated.csv"), "--stiffness", "30 N/mm"])
     text = Path("experiment.toml").read_text(encoding="utf-8")
     assert done.exit_code == 0 and '# vary = ["mu0"]' in text and '# by = "segment"' in text and '# trend = "slip"' in text
     options = ("--vary", "mu0", "--by", "segment", "--trend", "slip")

@@ -119,6 +119,11 @@ def drive_fitted(c: Columns) -> None:
     c.heading, c.toml = HEADING.replace("velocity [um/s]", "displacement [um]"), NO_DRIVE
 
 
+def drive_misfit(c: Columns) -> None:
+    c.V = np.cumsum(8.0 * (1 + 0.008 * np.sin(2 * np.pi * c.t / 3.0))) / 100
+    c.heading, c.toml = HEADING.replace("velocity [um/s]", "displacement [um]"), NO_DRIVE
+
+
 def friction(c: Columns) -> None:
     c.u *= 100
 
@@ -155,6 +160,7 @@ FLAWS: dict[str, tuple[Callable[[Columns], None], str]] = {
     "drive-differs": (drive_differs, "600 of 1200 velocities differ from the declared drive by more than 5 %, the first 8"),
     "drive-segmented": (drive_segmented, "2 constant or straight pieces describe them"),
     "drive-fitted": (drive_fitted, "a continuous line of 2 straight pieces"),
+    "drive-misfit": (drive_misfit, "times their noise: look at the column, or state the run's drive"),
     "friction": (friction, "are the units of what is observed, of load and stiffness right?"),
     "unit": (unit, "the heading says 'nm', [columns] says 'um', which counts"),
     "observable": (observable, "elongation is what is compared; the file also has force, left aside"),

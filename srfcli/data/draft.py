@@ -87,6 +87,7 @@ UNIT_SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
 STRESSES = {"normal_load": "normal_stress", "force": "shear_stress"}
 FORCE_OF_STRESS = {stress: force for force, stress in STRESSES.items()}
 OBSERVED = ("elongation", "force", "shear_stress", "friction")
+TOLD = ("friction", "drive-misfit")  # kinds of notices that mean that the file was misread, or is not what it seems
 NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
 HOLD_SPEED = 0.05  # of the slowest sliding, below which is a hold
 UNLIKE_START = 0.2  # of the usual friction: a record whose first readings are farther from it does not begin in steady sliding
@@ -366,7 +367,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     sketch, runs = _read(sketch, registry)
     if sketch.negative:
         remarks.append("compression is negative in the file: the load counts with the other sign")
-    remarks += [f"{run.name}: {notice.what}" for run in runs for notice in run.notices if notice.kind == "friction"]
+    remarks += [f"{run.name}: {notice.what}" for run in runs for notice in run.notices if notice.kind in TOLD]
     modulations = _modulations(runs)
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
     remarks.append(f"kind of experiment: {kind}, {why}")

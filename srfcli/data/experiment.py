@@ -413,6 +413,7 @@ NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "drive-differs": "the column of velocities is not the declared drive",
     "drive-segmented": "a drive found in noisy velocities",
     "drive-fitted": "a drive found in displacements",
+    "drive-misfit": "a drive found in displacements that differ from it by much more than their noise",
     "friction": "a friction coefficient that no surfaces have",
     "unit": "a heading and [columns] differ in unit",
     "observable": "more than one observable in the file",

@@ -190,13 +190,14 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         f"a continuous line of {slopes.size} {pieces}, {told} um/s, fitted through the displacements, "
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
-    if line.misfit > UNEXPLAINED * line.noise:
+    kind = "drive-misfit" if line.misfit > UNEXPLAINED * line.noise else "drive-fitted"
+    if kind == "drive-misfit":
         what += f", {line.misfit / line.noise:.0f} times their noise: look at the column, or state the run's drive"
     back = int(np.argmin(way))
     if -way[back] > line.misfit:
         told = f"{-way[back]:.3g} um at t = {line.knots[back]:.7g} s"
         what += f"; it goes back by {told}: state the run's drive if the stage did not"
-    return drive, [*notices, Notice("drive-fitted", where, what)]
+    return drive, [*notices, Notice(kind, where, what)]
 
 
 # A drive that turns back: the laws hold for sliding in one direction, so that each stroke is a run of its own.

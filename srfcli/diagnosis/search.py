@@ -56,6 +56,7 @@ WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns ar
 CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
 MOST_EFFECTS = 2  # effects of a model
 ALIKE_EFFECTS = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
+UNDERSTATED = 2.0  # times the gain at first order that an effect may bring beside a model that is far off or has taken it up
 MOST_FOLLOWED = 5  # promises of each model that are followed
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 SEARCH_RTOL = 1e-3  # tolerance of the integration: 0.02 in log likelihood
@@ -289,6 +290,9 @@ class ModelSearch:
             for again in (self._try_ageing_laws, self._refit_noise):
                 again(self.baseline)
                 self._search()
+        if not self.spent:
+            self._try_rivals()
+            self._search()
         self._where_effects_act()
         self._eliminate()
         simplest = self.best()
@@ -547,6 +551,20 @@ class ModelSearch:
             return self._record(self._judged(node.hypothesis, found), anew=True)
         except SrfError:  # it stays as it was
             return node
+
+    def _try_rivals(self) -> None:
+        """Push what may do as well in the place of one effect of the best model: by UNDERSTATED times what it promised there."""
+        best = self.best()
+        effects, ageing = best.hypothesis.effects, best.hypothesis.ageing
+        rests = [Hypothesis(tuple(e for e in effects if e is not left_out), ageing) for left_out in effects]
+        rests += [Hypothesis(effects)] if ageing else []
+        for rest in rests if best.passes else ():
+            node = self.fitted.get(rest.name)
+            if node is None or node.scores is None:
+                continue
+            beside = [(gain, s, Hypothesis((*rest.effects, s.effect), rest.ageing)) for gain, s in self._gains(node.scores)]
+            rivals = [(UNDERSTATED * gain, s) for gain, s, hypothesis in beside if hypothesis.name not in self.fitted]
+            self._promise(node, node, rivals, WORTH)
 
     def _try_ageing_laws(self, node: Fitted, *, afresh: bool = False) -> None:
         """Push the other ageing laws, each after a few steps from where the model or the best one stands.

@@ -61,6 +61,8 @@ class RunFit:
     @property
     def rms(self) -> float:
         """Return the root mean square of the residual over the samples that are compared."""
+        if not self.parts:  # a run that cannot be followed
+            return float("nan")
         values = np.concatenate([self.residual[a:b] for a, b in self.parts])
         return float(np.sqrt(np.mean(values**2)))
 

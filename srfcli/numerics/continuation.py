@@ -416,7 +416,7 @@ def find_components(
                 yield boundary
     except KeyboardInterrupt:
         boundary.status = Status.INTERRUPTED
-    boundary.notes = _notes(boundary, settings, missed)
+    boundary.notes = _notes(model, boundary, settings, missed)
     boundary.conclude(missed)
     yield boundary
 
@@ -524,13 +524,14 @@ def _across(model: GeneratedModel, plane: Plane, points: Sequence[CurvePoint]) -
     return Direction(plane.names, vectors, (plane.x.log, plane.y.log), np.array(rows)[:, None, :])
 
 
-def _notes(boundary: Boundary, settings: ContinuationSettings, missed: int) -> list[str]:
+def _notes(model: GeneratedModel, boundary: Boundary, settings: ContinuationSettings, missed: int) -> list[str]:
     plane = boundary.plane
+    x, y = ([model.declared(a.name, end) if a.name in model.names else end for end in (a.lo, a.hi)] for a in (plane.x, plane.y))
     lost = sum(len(s.lost) for s in boundary.scans)
     finest = max((s.resolution for s in boundary.scans), default=settings.resolution)
     notes = [
-        f"looked at {settings.lines} lines of constant {plane.x.name} from {plane.x.lo:g} to {plane.x.hi:g}, along "
-        f"{plane.y.name} from {plane.y.lo:.4g} to {plane.y.hi:.4g}, down to a spacing of {finest:.1g} in ln {plane.y.name}; "
+        f"looked at {settings.lines} lines of constant {plane.x.name} from {x[0]:g} to {x[1]:g}, along "
+        f"{plane.y.name} from {y[0]:.4g} to {y[1]:.4g}, down to a spacing of {finest:.1g} in ln {plane.y.name}; "
         f"a component that closes between two lines, or a narrower tongue, is not looked for (--scan-lines for more)"
     ]
     if lost:

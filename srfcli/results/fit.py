@@ -228,6 +228,7 @@ class FitResult(Result):
             rows.append((name, *shown, unit, start, flag(fit, k)))
         meta: dict[str, Any] = {
             "runs": [] if self.runs is None else self.runs.records(),
+            "against": self.against,
             "correlation": fit.correlation,
             "log_likelihood": fit.log_likelihood,
             "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
@@ -310,7 +311,7 @@ class FitResult(Result):
             notes.append(f"residuals are coloured in {', '.join(coloured)}: noise of that colour, or physics that is missing")
         notes += filter(None, [self.experiment.rescaled()])
         notes += [str(n) for n in self.experiment.notices if n.kind == "start-value"]
-        notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind == "reset"]
+        notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind in ("reset", "drive-misfit")]
         notes += [] if self.posterior is None else _posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
         if found.friction_field is not None:
@@ -608,6 +609,7 @@ STATED = (
     Column("k", "", "stiffness, stated or fitted, in the unit beside it"),
     Column("k_stderr", "", "empty where the stiffness is the stated one"),
     Column("k_unit", "", "as the experiment states it"),
+    Column("V0", "um/s", "reference velocity, of which mu0 is the friction"),
 )
 TRAILING = (Column("flags", "", "what is to be known before the row is used"), Column("reason", "", "why there is no fit"))
 
@@ -644,7 +646,7 @@ class CampaignResult(Result):
             columns += [Column(name, unit, "estimate"), Column(f"{name}_stderr", unit, "standard error", ".3g")]
         both = {"A", "B"} <= set(names)
         covariances = [Column(f"cov_{a}_{b}", "", "covariance") for a, b in PAIRS if {a, b} <= set(names)]
-        columns += [*(DERIVED if both else ()), *STATED, *covariances, *TRAILING]
+        columns += [*(DERIVED if both else ()), *(c for c in STATED if c.name not in names), *covariances, *TRAILING]
         cells = []
         for row in self.rows:
             found = {**row, **row.get("covariances", {})}

@@ -696,6 +696,8 @@ def _headline(data: Mapping[str, Any]) -> str:
         tail = f"; residuals are {number(ratio)} times the noise" if finite(ratio) else ""
         if finite(best.get("chi2")):
             tail = f"; χ² is {number(best['chi2'])} on {best.get('freedom')} degrees of freedom"
+        if (data.get("meta") or {}).get("against"):
+            tail += "; but the model does not explain the recordings"
         return ", ".join(told) + tail + _state(data)
     found = f"{notes[0][:1].upper()}{notes[0][1:]}" if notes else f"{_kind(data)}: {len(rows)} rows"
     return found + _state(data)

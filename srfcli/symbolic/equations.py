@@ -397,7 +397,7 @@ class _Builder:
         if left and system.effects:
             raise SrfError(
                 f"'{left[0]}' has no value where an effect uses it, in {system.title}",
-                "mu_dot and F_dot_over_W are known in `rate` alone, u in `rate`, `kappa` and the rates of an effect's own states",
+                "mu_dot and F_dot_over_W are known in a rate alone; u in a rate, in kappa and in an effect's own states",
             )
 
     def extra_rate(self, extra: ExtraState) -> sp.Expr:

@@ -151,6 +151,7 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
         "parameters": parameters, "rms_over_noise": _number(result.rms_over_noise()),
         "covariances": {f"cov_{a}_{b}": shared(a, b) for a, b in PAIRS},
     }  # fmt: skip
+    row["V0"] = next((q.value for q in experiment.parameters if q.name == "V0"), None)
     V = np.concatenate([np.abs(run.drive(run.t)) for run in runs])
     row |= {"V_min": float(V.min()), "V_max": float(V.max())}
     if found.difference is not None:

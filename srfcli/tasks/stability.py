@@ -138,7 +138,7 @@ def _without_hopf(model: GeneratedModel, p: Array) -> str:
         return "velocity strengthening: no Hopf"
     stable = [steady_is_stable(model, p, W0) for W0 in LOADS_TRIED * p[model.index("K")]]
     if None in stable or not math.isfinite(slope):
-        return "no value: the law's slopes overflow"
+        return "no value: the law, or a slope of it, is no number"
     if all(stable) or not any(stable):
         return f"no Hopf: {'stable' if stable[0] else 'unstable'} at every load looked at"
     return "no Hopf found"
