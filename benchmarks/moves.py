@@ -29,7 +29,7 @@ from srfcli.laws.registry import bundled_registry
 
 MOVES = (
     "_expand", "_try_built_in", "_try_ageing_laws", "_expand_without_field", "_refit_noise", "_try_rivals", "_where_effects_act",
-    "_eliminate", "_scan", "_fit_all",
+    "_eliminate", "_refit_elsewhere", "_fit_all",
 )  # fmt: skip
 
 

@@ -35,6 +35,7 @@ from srfcli.inference.state_space import (
     NOT_CONVERGED,
     Likelihood,
     Maximum,
+    Point,
     Predictive,
     StateSpaceFit,
     correlated,
@@ -65,6 +66,8 @@ BASELINES = 5.0  # times what the baseline took, if that is more: two effects, e
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 LARGEST_SHIFT = 10.0  # in the logarithm of a parameter, that a score can move it: beyond any bounds
 BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
+RESIZED_BY = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
+AGAIN = 9  # of them, about the best, whose other parameters are fitted too where the model fails a test: 26 % apart
 STRIDES = 12  # steps of another ageing law from the file's own start values, or on from where it promises to be likelier
 HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
 FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
@@ -373,7 +376,7 @@ class ModelSearch:
                 continue
             self._revise(move, found)
             if found is self.best() and not found.passes:
-                self._scan(found)
+                self._refit_elsewhere(found)
 
     def _revise(self, move: _Move, found: Fitted) -> None:
         """Raise what is expected of effects that are like a fitted one at first order by what that gained beyond its promise."""
@@ -518,17 +521,40 @@ class ModelSearch:
             sizes = (*self._sizes(node), {own[0]: values[own[0]]})
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
 
-    def _scan(self, node: Fitted) -> None:
-        """Fit a model that fails a test anew from where scans of parameters with narrow maxima lead, if that is likelier."""
+    def _refit_elsewhere(self, node: Fitted) -> None:
+        """Fit a model that fails a test anew where a scan, or another size of what is built in, leads somewhere likelier."""
+        found = self._scanned(node) or self._resized(node)
+        if found is not None and found.log_likelihood > node.fit.log_likelihood + NEEDED:
+            values = dict(found.values)
+            with contextlib.suppress(SrfError):  # else it stays as it was
+                self._record(self.fit(_Move(0.0, 0, node.hypothesis, values, self._sizes(node, values))))
+
+    def _scanned(self, node: Fitted) -> Point | None:
+        """Return the likeliest point that scans of parameters with narrow maxima lead to, None where it is no likelier."""
         if not self.experiment.runs:
-            return
+            return None
         likelihood = Likelihood(node.fit.likelihood.problem, processes=node.fit.likelihood.processes, rtol=SEARCH_RTOL)
         begun = likelihood.at(likelihood.coordinates(_followable(node.fit.values, likelihood.problem)))
         found = scan_narrow(likelihood, begun, self.progress)
-        if found and found.point.log_likelihood > node.fit.log_likelihood + NEEDED:
-            values = dict(found.point.values)
-            with contextlib.suppress(SrfError):  # else it stays as it was
-                self._record(self.fit(_Move(0.0, 0, node.hypothesis, values, self._sizes(node, values))))
+        return found.point if found and found.point.log_likelihood > node.fit.log_likelihood + NEEDED else None
+
+    def _resized(self, node: Fitted) -> Point | None:
+        """Return the likeliest point from other sizes of what is built in, the other parameters fitted under each.
+
+        So with the first of several inner parameters of an effect with states, as a frequency beside a damping; else None.
+        """
+        built = [n for e in node.hypothesis.effects if e.settings for n in (*(p.name for p in e.parameters), *e.frees)]
+        built += [e.scans[0][0] for e in node.hypothesis.effects if e.states and len(e.scans) > 1]
+        likelihood = node.fit.likelihood
+        name = next((n for n in likelihood.problem.names if n in built), None)
+        if name is None:
+            return None
+        trials, values = [], _followable(node.fit.values, likelihood.problem)
+        for ratio in np.geomspace(1 / RESIZED_BY, RESIZED_BY, AGAIN):
+            y = likelihood.coordinates({**values, name: values[name] * ratio})
+            trials.append(maximise(likelihood, y, held=[name], steps=STRIDES // 2, close=1.0, widths=(), progress=self.progress))
+        likeliest = max(trials, key=lambda f: f.point.log_likelihood)
+        return maximise(likelihood, likeliest.point.x, steps=STRIDES, close=1.0, widths=(), progress=self.progress).point
 
     def _refit_noise(self, base: Fitted) -> None:
         """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""
