@@ -156,3 +156,17 @@ def test_an_age_that_depends_on_the_load_is_at_rest_under_the_mean_load(tmp_path
     assert np.abs(model.rates(x, 10.0, 5.0, 0.0, p)).max() < 1e-9
     flat = srf.linear(srf.system(ageing=str(path)), over={"V": [10.0]}).to_dataframe().iloc[0]
     assert flat["W0"] == pytest.approx(7.888035439563494, rel=1e-9)
+
+
+def test_a_root_has_a_value_where_a_parameter_of_the_rate_is_0(tmp_path):
+    """1 - x + n (1 - x)^2 has x = 1 at n = 0, where the usual form of a quadratic's root is 0/0; so with - c phi beside."""
+    path = tmp_path / "own.toml"
+    path.write_text(
+        'format = "srf-law/1"\nkind = "ageing"\nname = "own"\nrate = "1 - v*phi/D0 - c*phi + n*(1 - v*phi/D0)**2"\n'
+        '[parameters]\nn = { default = 0.1 }\nc = { default = 0.1, unit = "1/s" }\n'
+    )
+    model = srf.system(ageing=str(path)).model
+    at = model.states.index("ln_phi")
+    for n, c in ((0.0, 0.0), (0.0, 2.0), (0.1, 2.0)):
+        x = np.exp(model.steady(model.vector({"V": 10.0, "n": n, "c": c}))[at]) * 10.0 / 0.402
+        assert 1 - x - c * x * 0.402 / 10.0 + n * (1 - x) ** 2 == pytest.approx(0.0, abs=1e-14)

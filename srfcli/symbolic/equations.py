@@ -141,7 +141,7 @@ def steady_age(
     repelling = False
     for root in _steady_roots(reduced, y):
         if _attracts(reduced, y, root, dict(values)):
-            return root * length / v
+            return _regular(root) * length / v
         repelling = True
     if repelling:
         raise SrfError(
@@ -160,6 +160,15 @@ def _steady_roots(reduced: sp.Expr, y: sp.Symbol) -> Iterator[sp.Expr]:
     with contextlib.suppress(NotImplementedError, TypeError):  # the latter where sympy compares symbols on its way
         if _may_be_solved(reduced, y):
             yield from (r for r in sp.solve(reduced, y) if not r.has(sp.I))
+
+
+def _regular(root: sp.Expr) -> sp.Expr:
+    """Return a root of a quadratic, (-b + sqrt(d))/(2 a), as 2 c/(-b - sqrt(d)) where a may be 0."""
+    singular = [p for p in sp.fraction(root)[1].free_symbols if not root.subs(p, 0).is_finite]
+    if not singular or len([a for a in root.atoms(sp.Pow) if a.exp == sp.Rational(1, 2)]) != 1:
+        return root
+    other = 1 / sp.radsimp(1 / root)
+    return other if all(other.subs(p, 0).is_finite is not False for p in singular) else root
 
 
 def _attracts(reduced: sp.Expr, y: sp.Symbol, root: sp.Expr, values: Mapping[sp.Symbol, float]) -> bool:
