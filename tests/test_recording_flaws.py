@@ -483,6 +483,17 @@ def test_stress_counts_as_force_on_a_square_millimetre(tmp_path: Path) -> None:
     assert c.read(tmp_path).load(np.array([1.0]))[0] == pytest.approx([5.0], rel=1e-12)
 
 
+def test_a_stiffness_of_stress_alone_says_that_stresses_were_recorded(tmp_path: Path) -> None:
+    """Friction under a load that has no unit of its own: nothing but the stiffness tells."""
+    c = Columns()
+    c.heading = HEADING.replace("normal_load [N]", "aside").replace("spring", "friction [1]")
+    c.u = 0.6 + 0.001 * c.u
+    c.toml = (
+        c.toml.replace("0.21 N/um", "210 MPa/mm").replace('elongation = { name = "spring", unit = "um" }', "") + "load = 5.0\n"
+    )
+    assert c.read(tmp_path).stress
+
+
 def test_scale_offset_and_intervals(tmp_path: Path) -> None:
     """[columns] turns counts of a converter and a code of sample intervals into quantities."""
     c = Columns()

@@ -561,7 +561,7 @@ def _begun(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, fl
         if run.name in modulations and modulations[run.name][2] <= run.t[0]:
             found[run.name] = "its load oscillates from the first sample on"
             continue
-        mu = (run.observed * run.friction_factor(run.load(run.t)[0]))[run.used]
+        mu = run.friction[run.used]
         first, usual = float(np.median(mu[:5])), float(np.median(mu))
         if abs(first - usual) > UNLIKE_START * abs(usual):
             found[run.name] = f"its friction begins at {first / usual:.0%} of its usual value"
@@ -599,7 +599,7 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
     surface = registry.get("interface", wish.interface)
     listed: list[Parameter] = [p for each in (law, base, *modifiers, surface) for p in each.parameters]
     V = float(np.median([next(iter(_slid(run)), 1.0) for run in runs]))
-    friction = [(run.observed * run.friction_factor(run.load(run.t)[0]))[run.used] for run in runs]
+    friction = [run.friction[run.used] for run in runs]
     mu = float(np.median(np.concatenate(friction)))
     lines = []
     for p in listed:

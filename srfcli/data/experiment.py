@@ -253,6 +253,9 @@ def _stated(node: Node, parameter: Parameter, geometry: Geometry) -> float:
 # One recording, from its description and its file to a run that can be compared with a simulation.
 
 
+STIFFNESS = "the stiffness"  # among the quantities of a run that count as stresses or as forces
+
+
 def read_run(run: RunDescription, described: Description, *, registry: Registry, format: str | None, limit: int) -> Run:
     """Return the run in a description's data file; raises SrfError for what cannot be used."""
     try:
@@ -282,12 +285,13 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
     at_start = load.rest(float(t[0]))
     stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
     rise = np.abs(drive(t)) * per_elongation(role, stiffness, at_start)
-    if units.pop("the stiffness", None) not in (None, *units.values()) and units:
+    recorded = {what: stress for what, stress in units.items() if what != STIFFNESS}
+    if recorded and units.get(STIFFNESS) not in (None, *recorded.values()):
         raise SrfError(
-            f"{run.node.where}: the stiffness is in {apparatus.stated}, and {', '.join(units)} "
-            f"{'is' if len(units) == 1 else 'are'} in units of {'stress' if any(units.values()) else 'force'}",
+            f"{run.node.where}: the stiffness is in {apparatus.stated}, and {', '.join(recorded)} "
+            f"{'is' if len(recorded) == 1 else 'are'} in units of {'stress' if any(recorded.values()) else 'force'}",
             'Say the area of the contact, area = "25 cm^2" under [apparatus] or --area of `srf new`, '
-            f"or give the stiffness in {'MPa/mm' if any(units.values()) else 'N/um'}.",
+            f"or give the stiffness in {'MPa/mm' if any(recorded.values()) else 'N/um'}.",
         )
     if len(set(units.values())) > 1:
         named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())
@@ -306,7 +310,7 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
         notices=(*notices, *told, *weighed, *flaws), stress=any(units.values()), proposed=proposed, others=tuple(others),
         backward=run.backward, segments=run.segments,
     )  # fmt: skip
-    friction = float(np.median((observed * read.friction_factor(load(t)[0]))[used])) if used.any() else 1.0
+    friction = float(np.median(read.friction[used])) if used.any() else 1.0
     if LEAST_FRICTION < abs(friction) < LARGEST_FRICTION:
         return read
     what = f"the friction coefficient is {friction:.3g}: are the units of what is observed, of load and stiffness right?"
@@ -330,7 +334,7 @@ def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[
     if run.load is not None and isinstance(text := run.node.child("load").value, str):
         found["load"] = is_stress(split_quantity(text, name="load")[1] or "N")
     if not apparatus.per_load:
-        found["the stiffness"] = is_stress(apparatus.stated)
+        found[STIFFNESS] = is_stress(apparatus.stated)
     return found
 
 

@@ -531,7 +531,7 @@ def _cost_without(t: Array, x: Array, sigma: Array, knots: Array, k: int) -> flo
     near = slice(int(a), max(int(b) + 1, int(a) + 2))
     kept = knots[low : high + 1]
     few = np.diff(np.searchsorted(t, knots[k - 1 : k + 2])) < FEWEST_OF_PIECE
-    if np.any(few & (np.diff(knots[k - 1 : k + 2]) < FEWEST_OF_PIECE * np.median(np.diff(t)))):
+    if few.any() and np.any(few & (np.diff(knots[k - 1 : k + 2]) < FEWEST_OF_PIECE * np.median(np.diff(t)))):
         return 0.0
     slopes = np.diff(_heights(t[near], x[near], sigma[near], kept)) / np.diff(kept)
     before, after = slopes[k - low - 1], slopes[k - low]

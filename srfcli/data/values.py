@@ -148,6 +148,11 @@ class Run:
         return {"elongation": self.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[self.observable]
 
     @property
+    def friction(self) -> Array:
+        """Return the friction coefficient of each reading (n,), by the stated stiffness."""
+        return np.asarray(self.observed * self.friction_factor(self.load(self.t)[0]))
+
+    @property
     def load_unit(self) -> str:
         """Return the unit of the load as it is shown: N or MPa."""
         return shown_unit("N", stress=self.stress)

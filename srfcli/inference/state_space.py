@@ -705,8 +705,7 @@ def first_level(t: Array, signal: Signal) -> float:
 
 def typical_friction(run: Run) -> float:
     """Return the typical friction coefficient of a recording."""
-    W = run.load(run.t[run.used])[0]
-    return float(np.median(np.abs(run.observed[run.used] * run.friction_factor(W))))
+    return float(np.median(np.abs(run.friction[run.used])))
 
 
 @dataclass(frozen=True)

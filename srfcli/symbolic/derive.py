@@ -30,8 +30,6 @@ class Linearisation:
     """
 
     characteristic: tuple[sp.Expr, ...]
-    mu_v: sp.Expr
-    mu_phi: tuple[sp.Expr, ...]
     hurwitz: tuple[sp.Expr, ...] | None
     names: dict[str, str] = field(default_factory=dict)
 
@@ -57,9 +55,8 @@ def linearise(system: System) -> Linearisation:
     hurwitz = _hurwitz_in_load(abbreviated, stiffness)
     if hurwitz is not None:
         hurwitz = tuple(e.xreplace(back).subs(meaning) for e in hurwitz)
-    mu_v, mu_phi, _ = friction_slopes(system)
     names = {str(s): str(e) for s, e in meaning[:-1]}
-    return Linearisation(characteristic, mu_v, mu_phi, hurwitz, names)
+    return Linearisation(characteristic, hurwitz, names)
 
 
 @lru_cache(maxsize=32)

@@ -115,21 +115,24 @@ def steady_states(system: System, load: sp.Expr | None = None) -> tuple[sp.Expr,
     values = {symbol(p.name): to_base(p.default, p.unit) for p in system.parameters}
     load, found = symbol("W0") if load is None else load, []
     for state in system.friction.states:
-        rate, length, phi = state_rate(system, state), symbol(state.length), symbol(state.name)
-        own = tuple((s, values[s]) for s in sorted(rate.free_symbols & set(values), key=str))
-        found.append(steady_age(rate, length, phi, system.ageing.name, own).subs(symbol("W"), load))
+        age = steady_age_formula(state_rate(system, state), symbol(state.length), symbol(state.name), system.ageing.name, values)
+        found.append(age.subs(symbol("W"), load))
     return tuple(found)
 
 
-@lru_cache(maxsize=32)  # systems that differ in what has no part in a rate have one in common
-def steady_age(
-    rate: sp.Expr, length: sp.Symbol, phi: sp.Symbol, name: str, values: tuple[tuple[sp.Symbol, float], ...]
-) -> sp.Expr:
+def steady_age_formula(rate: sp.Expr, length: sp.Symbol, phi: sp.Symbol, name: str, values: Mapping[sp.Symbol, float]) -> sp.Expr:
     """Return the age at which a rate vanishes at constant load and velocity v, as a formula in v.
 
-    Of several that one which is positive and attracts at these values of the rate's parameters. Raises SrfError where there is
-    none, and where no closed form is found.
+    Of several that one which is positive and attracts at these values of the parameters. Raises SrfError where there is none,
+    and where no closed form is found.
     """
+    return _steady_age(rate, length, phi, name, tuple((s, values[s]) for s in sorted(rate.free_symbols & set(values), key=str)))
+
+
+@lru_cache(maxsize=32)  # systems that differ in what has no part in a rate have one in common
+def _steady_age(
+    rate: sp.Expr, length: sp.Symbol, phi: sp.Symbol, name: str, values: tuple[tuple[sp.Symbol, float], ...]
+) -> sp.Expr:
     v, y = symbol("v"), sp.Symbol("y", positive=True)
     still = {symbol(n): sp.S.Zero for n in ("mu_dot", "W_dot", "F_dot_over_W")}
     reduced = sp.expand_log(sp.simplify(rate.subs(still).subs(phi, y * length / v)), force=True)

@@ -192,7 +192,7 @@ def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
 
 def _slopes(run: Run, length: float) -> Iterator[tuple[float, float]]:
     """Yield d mu/d slip (1/um) and its error for the end of each segment of constant velocity that is long enough."""
-    mu = run.observed * run.friction_factor(run.load(run.t)[0])
+    mu = run.friction
     for begin, end in pairwise(run.edges):
         V, rate, _ = run.drive.piece(begin)
         part = (run.t >= end - STEADY_TAIL * (end - begin)) & (run.t <= end) & run.used

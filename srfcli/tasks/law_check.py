@@ -24,8 +24,7 @@ from srfcli.laws.expression import expm1, log1p, symbol
 from srfcli.laws.law_file import COMMON, FORMULA, formula_of, kind_of
 from srfcli.laws.registry import Registry, bundled_registry
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, FrictionLaw, Interface, Law, State
-from srfcli.symbolic.equations import CHECKED_LOAD, CHECKED_VELOCITIES
-from srfcli.symbolic.equations import steady_age as age_formula
+from srfcli.symbolic.equations import CHECKED_LOAD, CHECKED_VELOCITIES, steady_age_formula
 from srfcli.symbolic.system import System, build_system, with_effects
 
 # What `srf law check` asks of a law: units, steady state, mu_v > 0, derivatives, worked values.
@@ -135,8 +134,8 @@ class _LawCheck:
             if phi is None:
                 raise SrfError(f"phi has no attracting steady value at v = {v:g} um/s", "The rate must fall through 0 at one.")
             found.append(phi * v / values["D0"])
-        own = tuple((symbol(p.name), values[p.name]) for p in self.parameters if symbol(p.name) in rate.free_symbols)
-        closed = age_formula(rate, symbol("D0"), symbol("phi"), law.name, own)
+        own = {symbol(name): value for name, value in values.items()}
+        closed = steady_age_formula(rate, symbol("D0"), symbol("phi"), law.name, own)
         for v, y in zip(CHECKED_VELOCITIES, found, strict=True):
             phi = y * values["D0"] / v
             exact = float(evaluate(closed, {**values, "v": v, "W": CHECKED_LOAD}))
