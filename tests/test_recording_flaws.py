@@ -119,6 +119,10 @@ def drive_fitted(c: Columns) -> None:
     c.heading, c.toml = HEADING.replace("velocity [um/s]", "displacement [um]"), NO_DRIVE
 
 
+def drive_steps(c: Columns) -> None:
+    c.V, c.toml = np.where(c.t < 6, 8.0, 80.0), NO_DRIVE
+
+
 def drive_misfit(c: Columns) -> None:
     c.V = np.cumsum(8.0 * (1 + 0.008 * np.sin(2 * np.pi * c.t / 3.0))) / 100
     c.heading, c.toml = HEADING.replace("velocity [um/s]", "displacement [um]"), NO_DRIVE
@@ -160,6 +164,7 @@ FLAWS: dict[str, tuple[Callable[[Columns], None], str]] = {
     "drive-differs": (drive_differs, "600 of 1200 velocities differ from the declared drive by more than 5 %, the first 8"),
     "drive-segmented": (drive_segmented, "2 constant or straight pieces describe them"),
     "drive-fitted": (drive_fitted, "a continuous line of 2 straight pieces"),
+    "drive-steps": (drive_steps, "the one at t = 6 s may be 0.01 s earlier, 0.72 um of the load point and "),
     "drive-misfit": (drive_misfit, "times their noise: look at the column, or state the run's drive"),
     "friction": (friction, "are the units of what is observed, of load and stiffness right?"),
     "unit": (unit, "the heading says 'nm', [columns] says 'um', which counts"),
@@ -569,6 +574,19 @@ def test_counts_of_an_encoder_are_no_steps_of_the_drive() -> None:
     drive, told = drive_from_displacement(t, np.round(np.interp(t, [0, 300, 600], [0, 30, 120])), "stage")
     assert drive.velocities == pytest.approx([0.1, 0.3], rel=1e-3)
     assert "times their noise" not in told[-1].what
+
+
+def test_a_motor_that_takes_half_a_second_to_its_next_velocity_ramps() -> None:
+    """A ramp has two corners near each other: neither is noise, and the pieces between them are not thrown away one by one."""
+    rng = np.random.default_rng(505)
+    near = [np.arange(at - 1.0, at + 2.0, 0.05) for at in (30.0, 40.5, 81.0)]
+    t = np.unique(np.concatenate([np.arange(0.0, 95.0, 0.5), *near]).round(4))
+    fine = np.arange(0.0, 96.0, 1e-3)
+    velocity = np.interp(fine, [0, 30, 30.5, 40.5, 41, 81, 81.5, 96], [3, 3, 30, 30, 3, 3, 9, 9])
+    x = np.interp(t, fine, np.cumsum(velocity) * 1e-3) + rng.normal(0.0, 0.02, t.size)
+    drive, _ = drive_from_displacement(t, x, "stage")
+    told = x[0] + drive.displacement(t)
+    assert np.abs(told - told.mean() - (x - x.mean())).max() < 0.5
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -32,6 +32,7 @@ from srfcli.data.description import FORMAT, ROLES, check_unit, read_description
 from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.groups import levels
 from srfcli.data.imposed import StartsAtRest, Stroke, find_modulation, strokes
+from srfcli.data.scales import scales_of
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
 
@@ -65,7 +66,7 @@ WORDS = {  # role -> words of a heading that mean it, where no heading is one of
     ),
     "load_point_displacement": (
         {"displacement", "disp", "displ", "position", "pos", "stroke", "slip", "distance", "travel", "angle", "rotation",
-         "theta", "strain", "lp", "ram", "stage", "sliding", "x", "gamma"}, {"um", "rad", "1"},
+         "theta", "strain", "lp", "lpd", "ram", "stage", "sliding", "x", "gamma"}, {"um", "rad", "1"},
     ),
     "normal_stress": (
         {"normal", "norm", "effective", "sn", "seff", "sigman", "sigma", "fn", "fz", "load", "axial", "weight"}, {"MPa", "N"},
@@ -90,7 +91,7 @@ OBSERVED = ("elongation", "force", "shear_stress", "friction")
 TOLD = ("friction", "drive-misfit")  # kinds of notices that mean that the file was misread, or is not what it seems
 NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
 HOLD_SPEED = 0.05  # of the slowest sliding, below which is a hold
-UNLIKE_START = 0.2  # of the usual friction: a record whose first readings are farther from it does not begin in steady sliding
+UNLIKE_START = 0.02  # of the friction before the first step: first readings that are farther from it are not of steady sliding
 SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps; with as many steps it has many
 STEP_BY_STEP = (  # what a run with many steps may need
     '# vary = ["mu0"]   # take the # away for a friction level of each step\'s own; "noise": a gauge noise of its own, too',
@@ -99,11 +100,9 @@ STEP_BY_STEP = (  # what a run with many steps may need
 )
 STROKES = 40  # of a file that are written
 LETTERS = "A is a, B is b, D0 is Dc (or L), mu is tau/sigma, W is sigma, K is k; a stress in MPa counts as the force on 1 mm^2"
-ROCK_START = {  # start values and bounds of A, B and D0 that hold most velocity steps on rock and gouge
-    "A": (0.01, 0.0005, 0.05),
-    "B": (0.01, 0.0002, 0.05),
-    "D0": (10.0, 0.5, 500.0),
-}
+FRICTION_START = {"A": (0.01, 0.0005, 0.05), "B": (0.01, 0.0002, 0.05)}  # start value and bounds: rock, gouge, polymers, paper
+SLIP_LENGTH = (10.0, 0.5, 500.0)  # um, of D0: rock and gouge
+LENGTHS_IN_SEGMENT = 50.0  # of slip at one velocity: a slip length from there where it is ten times off that of rock
 RIG = {
     "radius": "of the sliding circle: torque over it is the force, angle times it the displacement",
     "thickness": "of the sheared layer: strain times it is the displacement",
@@ -561,10 +560,11 @@ def _begun(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, fl
         if run.name in modulations and modulations[run.name][2] <= run.t[0]:
             found[run.name] = "its load oscillates from the first sample on"
             continue
-        mu = run.friction[run.used]
-        first, usual = float(np.median(mu[:5])), float(np.median(mu))
+        until = run.edges[1] if len(run.edges) > 1 else run.t[-1]
+        mu, before = run.friction[run.used], run.friction[run.used & (run.t <= until)]
+        first, usual = float(np.median(mu[:5])), float(np.median(before if before.size > 10 else mu))
         if abs(first - usual) > UNLIKE_START * abs(usual):
-            found[run.name] = f"its friction begins at {first / usual:.0%} of its usual value"
+            found[run.name] = f"its friction begins at {first / usual:.0%} of what it is before the first step"
     return found
 
 
@@ -609,17 +609,27 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
         elif p.name == "mu0":
             low, high = sorted((_short(0.6 * mu), _short(1.4 * mu)))
             lines.append(f"mu0 = {{ value = {_short(mu)}, lower = {low}, upper = {high} }}   # median of the recording")
-        elif p.name in ROCK_START and wish.law == "dieterich-ruina":
-            value, low, high = ROCK_START[p.name]
+        elif p.name in FRICTION_START or p.name == "D0":
+            value, low, high = FRICTION_START.get(p.name) or _slip_length(runs)
             lines.append(f"{p.name} = {{ value = {value}, lower = {low}, upper = {high} }}{about}")
         else:
             low, high = max(p.lower, _short(p.default / BOUND_FACTOR)), min(p.upper, _short(p.default * BOUND_FACTOR))
+            low = p.lower if any(p in each.parameters for each in modifiers) else low  # there may be nothing of it
             held = ", fixed = true" if not low < high else f", lower = {low}, upper = {high}"
             lines.append(f"{p.name} = {{ value = {p.default!r}{held} }}{about}")
     number, unit = split_quantity(wish.stiffness, name="--stiffness")
     pair = f'lower = "{_short(number / 2)} {unit}", upper = "{_short(2 * number)} {unit}"'
     lines.append(f'# K = {{ value = "{wish.stiffness}", {pair} }}   # take the # away to fit the stiffness, too')
     return lines
+
+
+def _slip_length(runs: Sequence[Run]) -> tuple[float, float, float]:
+    """Return start value and bounds of D0 (um): of rock, or of slip at one velocity where that is much shorter or longer."""
+    value, low, high = SLIP_LENGTH
+    seen = scales_of(runs, ()).get("segment", LENGTHS_IN_SEGMENT * value) / LENGTHS_IN_SEGMENT
+    if abs(math.log(seen / value)) < math.log(10):
+        return SLIP_LENGTH
+    return float(f"{seen:.1g}"), float(f"{seen * low / value:.1g}"), float(f"{seen * high / value:.1g}")
 
 
 def _short(value: float) -> float:

@@ -310,11 +310,31 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
         notices=(*notices, *told, *weighed, *flaws), stress=any(units.values()), proposed=proposed, others=tuple(others),
         backward=run.backward, segments=run.segments,
     )  # fmt: skip
+    if run.drive is None and columns.role("load_point_velocity") is not None:
+        read = replace(read, notices=(*read.notices, *_late_steps(read, columns.place("load_point_velocity").column)))
     friction = float(np.median(read.friction[used])) if used.any() else 1.0
     if LEAST_FRICTION < abs(friction) < LARGEST_FRICTION:
         return read
     what = f"the friction coefficient is {friction:.3g}: are the units of what is observed, of load and stiffness right?"
     return replace(read, notices=(*read.notices, Notice("friction", columns.place(role).column, what)))
+
+
+def _late_steps(run: Run, where: str) -> list[Notice]:
+    """Return a notice where a step of the drive may have been up to a sampling interval earlier, and that would show."""
+    at = np.searchsorted(run.t, run.drive.times[1:])
+    at = at[(at > 0) & (at < run.t.size)]
+    late = np.abs(run.drive(run.t[at]) - run.drive(run.t[at - 1])) * (run.t[at] - run.t[at - 1])
+    shown = late * per_elongation(run.observable, run.stiffness, run.first_load)
+    noise = white_level(run.observed[run.used])
+    if not late.size or not shown.max() > LATE * noise > 0:
+        return []
+    k = int(np.argmax(shown))
+    t, interval = run.t[at[k]], run.t[at[k]] - run.t[at[k] - 1]
+    what = (
+        f"each step of the velocity is taken to be at the sample that has the new one; the one at t = {t:.6g} s may be "
+        f"{interval:.3g} s earlier, {late[k]:.3g} um of the load point and {shown[k] / noise:.0f} times the noise"
+    )
+    return [Notice("drive-steps", where, what)]
 
 
 def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
@@ -400,6 +420,7 @@ def clean_observable(
 
 # The check of a recording: sampling, flaws, noise, and the history of drive and load, as found in the data.
 
+LATE = 10.0  # times the noise of what is observed, from where it is told that a step of the drive may have been between samples
 LEAST_FRICTION, LARGEST_FRICTION = 0.01, 3.0  # that surfaces which slide in contact have
 NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "gap": "samples are missing",
@@ -417,6 +438,7 @@ NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "drive-differs": "the column of velocities is not the declared drive",
     "drive-segmented": "a drive found in noisy velocities",
     "drive-fitted": "a drive found in displacements",
+    "drive-steps": "a step of the drive that may have been between two samples, and would show",
     "drive-misfit": "a drive found in displacements that differ from it by much more than their noise",
     "friction": "a friction coefficient that no surfaces have",
     "unit": "a heading and [columns] differ in unit",

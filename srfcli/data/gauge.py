@@ -79,10 +79,11 @@ def _swing(colour: tuple[float, ...], lag: Array) -> tuple[Array, Array, Array, 
     return a, b, ((grown + fallen) / 2).real, s, a**2 - b**2
 
 
-def colour_text(colour: tuple[float, ...]) -> str:
+def colour_text(colour: tuple[float, ...], unit: str = "") -> str:
     """Return a process in words; an oscillation is smooth noise at a quality of a half, a spectral line at a large one."""
-    told = f"{colour[1]:.3g} correlated over {colour[0]:.3g} s"
-    return told if len(colour) == 2 else f"{colour[1]:.3g} about {colour[0]:.3g} Hz, of quality {colour[2]:.2g}"
+    size = f"{colour[1]:.3g} {unit}".rstrip()
+    told = f"{size} correlated over {colour[0]:.3g} s"
+    return told if len(colour) == 2 else f"{size} about {colour[0]:.3g} Hz, of quality {colour[2]:.2g}"
 
 
 @dataclass(frozen=True)

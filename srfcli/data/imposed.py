@@ -182,6 +182,8 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         what = f"the displacement jumps by {size:.4g} um after t = {t[known][at]:.7g} s: {done}"
         notices.append(Notice("reset", where, what))
     way = np.diff(line.heights)
+    readings = np.maximum(np.histogram(t[known], line.knots)[0], 1)
+    way[np.abs(way) < line.misfit * np.sqrt(12 * np.log(known.sum()) / readings)] = 0.0  # a hold: as in `_piece`
     slopes = way / np.diff(line.knots)
     drive = Drive.steps(list(zip([float(t[0]), *line.knots[1:-1].tolist()], slopes.tolist(), strict=True)))
     pieces = "straight piece" if slopes.size == 1 else "straight pieces"
@@ -386,19 +388,20 @@ def _without_corners(t: Array, x: Array, step: float) -> Array:
     basis, rest = np.linalg.qr(np.vander(place, 3))[0], x - x.mean()
     rest = rest - basis @ (basis.T @ rest)
     columns -= basis @ (basis.T @ columns)
-    for _ in range(MOST_CORNERS):
+    kept, power = rest, float(rest @ rest)
+    for number in range(1, MOST_CORNERS + 1):
         sizes = np.maximum(np.sum(columns**2, axis=0), 1e-300)
         gains = (columns.T @ rest) ** 2 / sizes
         best = int(np.argmax(gains))
         direction = columns[:, best] / np.sqrt(sizes[best])
-        power = float(rest @ rest)
-        less = rest - direction * float(direction @ rest)
-        one_count = best >= edges.size and abs(float(direction @ rest)) / np.sqrt(sizes[best]) < 1.5 * step
-        if one_count or not float(less @ less) < power / CORNER:
+        along = float(direction @ rest)
+        if best >= edges.size and abs(along) / np.sqrt(sizes[best]) < 1.5 * step:
             break
-        rest = less
+        rest = rest - direction * along
+        if float(rest @ rest) < power / CORNER**number:  # two that are a ramp may do so together
+            kept = rest
         columns -= np.outer(direction, direction @ columns)
-    return rest
+    return kept
 
 
 def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
@@ -515,8 +518,15 @@ def _pruned(t: Array, x: Array, sigma: Array, knots: Array, penalty: float) -> A
         if costs[weakest] > penalty * 2 / 3:
             break
         knots = np.delete(knots, weakest + 1)
+        if costs[weakest] == 0.0:  # two knots of a ramp that stood too close to another move apart
+            low, high = max(weakest - 1, 0), min(weakest + 3, knots.size)
+            a, b = np.searchsorted(t, knots[[low, high - 1]])
+            near = slice(int(a), int(b) + 1)
+            if high - low > 2 and int(b) + 1 - int(a) > 4 * (high - low):
+                knots = knots.copy()
+                knots[low:high] = _polished(t[near], x[near], sigma[near], knots[low:high])[0]
         del costs[weakest]
-        for k in range(max(weakest - 2, 0), min(weakest + 2, len(costs))):
+        for k in range(max(weakest - 3, 0), min(weakest + 3, len(costs))):
             costs[k] = _cost_without(t, x, sigma, knots, k + 1)
     return knots
 
@@ -625,6 +635,7 @@ NEGLIGIBLE = 1e-5  # of the load's range: noise below it is interpolated and not
 BLOCKS = 16  # whose means are compared to see whether a load is constant
 ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
 NO_CONTACT = 1e-15  # N: no contact
+SAMPLES_A_PERIOD = 8  # of a modulation, from which a column shows it to 1e-3 of its amplitude
 SMALLEST_MODULATION = 5e-4  # relative amplitude of a modulation, at least: a servo varies the load by less
 
 
@@ -645,7 +656,15 @@ def load_of(run: RunDescription, columns: Columns, unit: str) -> tuple[Load, lis
             f"the load is {run.load:g} {unit}, but {place.column} begins with {first:g} {unit}", "Take one of the two away."
         )
     if run.modulation is not None:
-        notices += modulation_notices(place, run.modulation, values)
+        f, eps, onset = run.modulation
+        told = modulation_notices(place, run.modulation, values)
+        if f * float(np.median(np.diff(place.t))) > 1 / SAMPLES_A_PERIOD:
+            stated = Modulation(first, eps, f, onset)
+            if np.nanstd(values - stated(place.t)[0]) < DIFFERS * np.nanstd(values):
+                return stated, notices
+            what = f"fewer than {SAMPLES_A_PERIOD} samples a period of {f:.6g} Hz do not show the load between them"
+            told = [Notice("modulation-differs", place.column, f"{what}, and it is not as declared; the column counts")]
+        notices += told
     return load, notices
 
 

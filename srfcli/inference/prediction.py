@@ -46,8 +46,17 @@ def own_start(model: GeneratedModel, run: Run, p: Array, name: str, trend: str |
         return mu, mu - wide, mu + wide
     if kind in {n for names in GAUGES.values() for n in names}:
         return _gauge_start(run, kind)
-    steady = float(np.asarray(model.steady(p))[model.states.index(kind)])
+    steady = float(np.asarray(model.steady(driven(model, run, p)))[model.states.index(kind)])
     return steady, steady - 15.0, steady + 15.0
+
+
+def driven(model: GeneratedModel, run: Run, p: Array) -> Array:
+    """Return p; of a run that begins at rest, where nothing slides steadily, with the fastest drive that it has."""
+    if run.drive.at(float(run.t[0])) > 0:
+        return p
+    q = p.copy()
+    q[model.index("V")] = float(np.max(np.abs(run.drive(run.t))))
+    return q
 
 
 def first_friction(run: Run) -> float:
@@ -106,7 +115,7 @@ def _balanced(
     V, W = run.drive.at(float(run.t[0])), run.first_load
     ages, iv = _ages(model), states.index("ln_v")
     mu = values[f"{run.name}.mu"]
-    x = np.asarray(model.steady(p)).astype(complex)
+    x = np.asarray(model.steady(driven(model, run, p))).astype(complex)
     for age in ages:
         x[states.index(age)] = values[f"{run.name}.{age}"]
     for _ in range(60):  # Newton in ln v; friction is close to linear there

@@ -288,6 +288,23 @@ class FitResult(Result):
         signs = np.array([1.0 if found.fit.names[k] == "A" else -1.0 for k in free])
         return known["A"] - known["B"], float(np.sqrt(max(float(signs @ own @ signs), 0.0)))
 
+    def _colours(self) -> list[str]:
+        """Return what coloured gauge noise was found, of which observable and in which runs unless in all."""
+        fitted, runs = [f for f in self._observables if not f.holdout], {run.name: run for run in self.experiment.runs}
+        kinds: dict[tuple[tuple[float, ...], str, str], list[str]] = {}
+        for f in fitted:
+            observable = f.observable or runs[f.name].observable
+            unit = runs[f.name].unit_of(observable)
+            for colour in f.colours:
+                kinds.setdefault((colour, observable, "" if unit == "1" else unit), []).append(f.name)
+        several, notes = len({f.observable for f in fitted}) > 1, []
+        for (colour, observable, unit), names in kinds.items():
+            of = f" of {observable}" if several else ""
+            of += f" in {', '.join(names)}" if len(set(names)) < len({f.name for f in fitted}) else ""
+            comma = "," if len(colour) == 3 else ""
+            notes.append(f"gauge noise{of}: {colour_text(colour, unit)}{comma} besides white noise, or physics that is missing")
+        return notes
+
     def _notes(self) -> list[str]:
         """Return what is to be known beside the numbers, in sentences."""
         found, fit = self.found, self.found.fit
@@ -303,15 +320,16 @@ class FitResult(Result):
         notes.append("intervals: " + (whose if self.intervals else "1.96 standard errors; --profile refits") + ", 95 %")
         if len(found.starts) > 1:
             notes.append(f"{sum(same for _, same in found.starts)} of {len(found.starts)} starts ended in this minimum")
-        for colour in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):
-            comma = "," if len(colour) == 3 else ""
-            notes.append(f"gauge noise: {colour_text(colour)}{comma} besides white noise, or physics that is missing")
+        notes += self._colours()
         coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
         if coloured:
             notes.append(f"residuals are coloured in {', '.join(coloured)}: noise of that colour, or physics that is missing")
         notes += filter(None, [self.experiment.rescaled()])
         notes += [str(n) for n in self.experiment.notices if n.kind == "start-value"]
-        notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind in ("reset", "drive-misfit")]
+        field = found.state_space is not None and not found.state_space.smooth
+        unexplained = self.against or field or any(f.colours for f in fit.runs)  # else each step was where it was taken to be
+        told = ("reset", "drive-misfit", *(("drive-steps",) if unexplained else ()))
+        notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind in told]
         notes += [] if self.posterior is None else _posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
         if found.friction_field is not None:
