@@ -111,11 +111,14 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
         runs = [whole(run | {"augmented": run["baseline"]}) for run in runs]
     rows = [{"axis": "v", "run": "", "kind": "mean", "low": 10.0**k, "high": 10.0 ** (k + 1), "statistic": 3.0 * k, "z": 1.0,
              "freedom": 1.0, "log_p": -5.0 * k, "p_value": 10.0 ** (-2 * k)} for k in range(5)]  # fmt: skip
+    told = {"identified": ("linker-dieterich",), "ambiguous": ("linker-dieterich", "second-state"), "unknown": ()}.get(
+        verdict, ("none",)
+    )
     material: dict[str, Any] = {
         "title": "PMMA <on> PMMA", "runs": runs, "residual_scan": rows,
-        "ranked": [{"name": "linker-dieterich", "evidence": -10.0, "rms_over_noise": 0.99, "p_value": 0.4},
-                   {"name": "second-state", "evidence": -11.5, "rms_over_noise": 0.993, "p_value": 0.38},
-                   {"name": "none", "evidence": -900.0, "rms_over_noise": 3.19, "p_value": 0.0}],
+        "ranked": [{"name": n, "evidence": e, "rms_over_noise": r, "confidence": c, "told": n in told}
+                   for n, e, r, c in (("linker-dieterich", -10.0, 0.99, 0.98), ("second-state", -11.5, 0.993, 0.01),
+                                      ("none", -900.0, 3.19, 0.0))],
         "parameters": [{"name": "B", "unit": "1", "baseline": 0.0259135, "baseline_stderr": 1.1e-4, "augmented": 0.0242,
                         "augmented_stderr": 1.3e-4, "shift_sigma": 10.06},
                        {"name": "alpha", "unit": "1", "baseline": None, "baseline_stderr": None, "augmented": 0.012,
@@ -303,6 +306,20 @@ def test_the_run_with_most_of_the_misfit_comes_first(tmp_path: Path) -> None:
     write_report(tmp_path, made_answer("identified"), made_material("identified"))
     text = read(tmp_path).text.partition("p of noise stands out at")[2]
     assert text.index("onset") < text.index("quiet") < text.index("later")
+
+
+@pytest.mark.usefixtures("without_matplotlib")
+def test_the_confidence_that_is_told_is_that_of_the_model_in_the_table(tmp_path: Path) -> None:
+    """Also of an effect in one run alone, whose model has the run in its name, and where a likelier one was refused."""
+    material = made_material("identified")
+    first = {"name": "viscous-drag", "evidence": -9.0, "rms_over_noise": 0.99, "confidence": 0.29, "told": False}
+    material["ranked"][0] |= {"name": "linker-dieterich[onset]", "confidence": 0.56}
+    material["ranked"].insert(0, first)
+    write_report(tmp_path, made_answer("identified"), material)
+    page = read(tmp_path)
+    assert "confidence 56 %" in page.text and "the log evidence rises by 890" in page.text
+    chosen = page.text.partition("against it")[2]
+    assert chosen.index("viscous-drag") < chosen.index("linker-dieterich[onset]")
 
 
 def test_no_name_breaks_out_of_the_page(tmp_path: Path) -> None:

@@ -47,10 +47,15 @@ def concluded(monkeypatch):
         monkeypatch.setattr(module, "on_the_track_of", lambda best, baseline: baseline)
         monkeypatch.setattr(module, "at_bounds", lambda best: [])
         monkeypatch.setattr(module, "uneven_noise", lambda fit: [])
+        monkeypatch.setattr(module, "unsteady_start", lambda search, best: [])
         ranked = sorted(fits, key=lambda f: -f.evidence)
         baseline = next(f for f in fits if f.name == "none")
-        search = SimpleNamespace(ranked=lambda: ranked, baseline=baseline, excluded=[], cut_short=cut_short, budget=150.0)
-        return conclude(search, SimpleNamespace(runs=(), thresholds=()))
+        monkeypatch.setattr(module, "not_the_same", lambda baseline, best: [])
+        whole = SimpleNamespace(runs=(), thresholds=(), vary=())
+        search = SimpleNamespace(
+            ranked=lambda: ranked, baseline=baseline, excluded=[], cut_short=cut_short, budget=150.0, whole=whole, on_request=[]
+        )
+        return conclude(search, whole)
 
     return verdict
 

@@ -214,10 +214,12 @@ def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return what was fitted, best evidence first; of models that are equal to the digit shown, the final one."""
     became = {name: f"it has become {law}" for name, law in diagnosis.became.items()}
     ranked = sorted(diagnosis.ranked, key=lambda f: (-round(f.evidence, 1), f is not diagnosis.final))
+    told = {f.name for f in diagnosis.close} if diagnosis.verdict == "ambiguous" else {diagnosis.final.name}
     return [
         {"name": f.name, "evidence": f.evidence, "rms_over_noise": f.fit.maximum.point.rms,
          "field": 0.0 if f.fit.smooth else f.fit.values["field_amplitude"], "confidence": diagnosis.confidence.get(f.name, 0.0),
-         "against": f.against[0] if f.against else became.get(f.name, "")}
+         "against": f.against[0] if f.against else became.get(f.name, ""),
+         "told": diagnosis.verdict != "unknown" and f.name in told}
         for f in ranked
     ]  # fmt: skip
 

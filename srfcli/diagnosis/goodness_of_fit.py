@@ -93,8 +93,11 @@ def field_share(found: StateSpaceFit) -> float:
 
 
 def taken_up(found: StateSpaceFit) -> bool:
-    """Return whether field or gauge noise has taken up more than either can be."""
-    return field_share(found) > 1 or any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
+    """Return whether field or gauge noise has taken up more than either can be, or the field is as long as it may be: a trend."""
+    if field_share(found) > 1 or any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point)):
+        return True
+    at = -1 if found.smooth else found.likelihood.names.index("field_length")
+    return not found.smooth and bool(found.maximum.point.x[at] >= found.likelihood.upper[at])
 
 
 def loudness(likelihood: Likelihood, point: Point) -> list[tuple[float, str]]:

@@ -21,6 +21,7 @@ from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.symbolic.system import without_part
 
+LAW_BOUNDS = 5.0  # from the defaults of another ageing law to the bounds of what it has of its own
 ABSENT = 1e-3  # of the least size of an effect: what it does in a run where it does not act is far below any noise
 UNMODULATED = {symbol(name): 0 for name in ("modulated", "eps", "envelope")}
 
@@ -175,6 +176,7 @@ class Hypothesis:
         experiment = self.experiment(experiment)
         model = self.model(registry, experiment, random_field=random_field)
         added = [q for e in self.effects for q in fit_parameters(e, model, experiment)]
+        added += law_parameters(registry, self.ageing, experiment) if self.ageing else []
         at = at or {}
         names = {q.name for q in added}
         kept = [q for q in experiment.parameters if q.name not in names]
@@ -205,6 +207,18 @@ def typical_sizes(effect: Effect) -> dict[str, float]:
     """Return the distance of an effect's sizes from their neutral values in its file's defaults, in um, s, N."""
     neutral = neutral_values(effect)
     return {p.name: abs(to_base(p.default, p.unit) - neutral[p.name]) for p in effect.parameters if p.name in neutral}
+
+
+def law_parameters(registry: Registry, ageing: str, experiment: Experiment) -> list[FitParameter]:
+    """Return start values and bounds, in um, s, N, of what an ageing law has that an experiment does not list."""
+    law, _ = registry.ageing(ageing)
+    listed, found = {q.name for q in experiment.parameters}, []
+    for p in law.parameters:
+        if p.name not in listed and p.default > 0:
+            low, high = max(p.lower, p.default / LAW_BOUNDS), min(p.upper, p.default * LAW_BOUNDS)
+            value, low, high = (to_base(x, p.unit) for x in (p.default, low, high))
+            found.append(FitParameter(p.name, value, low, high, False, p.unit))
+    return found
 
 
 def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment) -> list[FitParameter]:

@@ -22,12 +22,14 @@ from srfcli.data.values import Experiment, Run, per_elongation
 from srfcli.diagnosis.hypotheses import Excluded, Shape, along_table, inner_grid, neutral_values, own_parameters
 from srfcli.inference.critical_loads import TableLikelihood, apparatus
 from srfcli.inference.kalman import gains
+from srfcli.inference.prediction import own_names, own_start, run_parameters
 from srfcli.inference.recordings import slip_along
 from srfcli.inference.shared_field import FieldPrior
 from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns, filter_run
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 
+ALIKE = 0.97  # likeness of two effects' projected columns beyond which they are one class
 NODES, MOST_NODES = 0.4, 400  # of a shared field: correlation lengths between them; how many
 NO_COLUMN = 1e-100  # of a column's squares: a bump beyond the ends of all runs, say
 COLUMNS_TOGETHER = 32  # columns that are projected at a time
@@ -69,6 +71,11 @@ class _Column:
     whole: float = 0.0
     taken: Array | None = None
     along: Array | None = None
+
+    @property
+    def tolerance(self) -> float:
+        """Return the share of its square that what was fitted cannot absorb."""
+        return float(np.sum(self.columns**2)) / self.whole
 
 
 @dataclass(frozen=True)
@@ -158,6 +165,34 @@ class Remainder:
         return best
 
 
+@dataclass(frozen=True)
+class OwnValue:
+    """A parameter with a value of its own in one run: what that gains in log likelihood at first order, and the change there."""
+
+    gain: float
+    parameter: str
+    run: str
+    change: float
+
+
+def own_values(remainder: Remainder) -> list[OwnValue]:
+    """Return what each parameter that runs share would gain by a value of its own in one of them, largest gain first."""
+    runs, names, end, found = remainder.fitted.maximum.point.runs, remainder.fitted.likelihood.problem.names, 0, []
+    for f in runs if len(runs) > 1 else ():
+        shared = [n for n in f.names if n in names and "[" not in n and not n.startswith(f"{f.run.name}.")]
+        columns = np.zeros((remainder.rest.size, len(shared)))
+        columns[end : end + 2 * f.white.size] = _stacked(*_whitened(f))[:, [f.names.index(n) for n in shared]]
+        end += 2 * f.white.size
+        free = remainder.free(columns)
+        power, g = np.sum(free**2, axis=0), free.T @ remainder.left
+        known = power > NO_COLUMN
+        found += [
+            OwnValue(0.5 * float(b) ** 2 / float(a), n, f.run.name, float(b / a))
+            for n, a, b in zip(np.array(shared)[known].tolist(), power[known], g[known], strict=True)
+        ]
+    return sorted(found, key=lambda v: -v.gain)
+
+
 class Scores:
     """The scores around a fit, of a model that has the effects `present`; `excluded` are those that cannot join it."""
 
@@ -174,7 +209,15 @@ class Scores:
         self.excluded: list[Excluded] = []
         self.shared = self.remainder.shared
         self.columns = self._projected(self._all(candidates))
-        self.singles = self._best_of(self.columns)
+        self.every = self._best_of(self.columns)
+
+    @cached_property
+    def singles(self) -> list[Score]:
+        """The best score of each effect under the name that it is reported by, largest gain first."""
+        best: dict[str, Score] = {}
+        for score in self.every:
+            best.setdefault(score.effect.reported, score)
+        return list(best.values())
 
     def _all(self, candidates: Sequence[Effect]) -> list[_Column]:
         shapes = {e.name: shape for e in candidates if (shape := along_table(e)) is not None}
@@ -216,15 +259,11 @@ class Scores:
         likelihood = self.fitted.likelihood
 
         def block(run: Run) -> Array:
+            own, trend = likelihood.problem.local(run, values), likelihood.problem.trend
+            p = run_parameters(model, self.experiment, run, own)
+            begun = {n: own_start(model, run, p, n, trend)[0] for n in own_names(model, run, trend) if n not in own}
             found = filter_run(
-                model,
-                self.experiment,
-                run,
-                likelihood.problem.local(run, values),
-                by=by,
-                gauges=likelihood.gauges(run),
-                trend=likelihood.problem.trend,
-                rtol=likelihood.rtol,
+                model, self.experiment, run, own | begun, by=by, gauges=likelihood.gauges(run), trend=trend, rtol=likelihood.rtol
             )
             return _stacked(*_whitened(found))
 
@@ -377,27 +416,37 @@ class Scores:
         return 0.5 * float(g @ size), size, inverse
 
     def _best_of(self, columns: Sequence[_Column]) -> list[Score]:
-        """Return the best score of each effect, largest gain first."""
+        """Return the best score of each effect, variants of one apart, largest gain first."""
         best: dict[str, Score] = {}
         for column in columns:
-            gain, size, covariance = self._judge(column)
-            effect = column.effect
-            if not self._possible(column, size):
-                gain = 0.0
-            if effect.reported in best and best[effect.reported].gain >= gain:
-                continue
-            error = float(np.sqrt(max(covariance[0, 0], 0.0)))
-            free = float(np.sum(column.columns**2)) / column.whole
-            values = self._expected(column, size)
-            direction = column.columns @ size
-            norm = float(np.linalg.norm(direction))
-            shifts = np.zeros(0) if column.taken is None else self.remainder.shifts(column.taken @ size)
-            best[effect.reported] = Score(
-                effect, gain, values, float(size[0]), error, error * np.sqrt(24.0), free,
-                direction / norm if norm > 0 else direction,
-                dict(zip(self.fitted.likelihood.names, shifts.tolist(), strict=False)),
-            )  # fmt: skip
+            score = self._score(column)
+            if column.effect.name not in best or best[column.effect.name].gain < score.gain:
+                best[column.effect.name] = score
         return sorted(best.values(), key=lambda s: -s.gain)
+
+    def absorbed(self, before: Scores) -> list[Score]:
+        """Return the score of each effect of which this fit absorbs what that `before` did not, where it absorbs most."""
+        left = {(c.effect.name, *c.inner.items()): c.tolerance for c in before.columns}
+        least: dict[str, tuple[float, _Column]] = {}
+        for column in self.columns:
+            share = column.tolerance / max(left.get((column.effect.name, *column.inner.items()), 0.0), 1e-300)
+            if share < least.get(column.effect.name, (1 - ALIKE**2,))[0]:
+                least[column.effect.name] = share, column
+        return [self._score(column) for _, column in least.values()]
+
+    def _score(self, column: _Column) -> Score:
+        gain, size, covariance = self._judge(column)
+        if not self._possible(column, size):
+            gain = 0.0
+        error = float(np.sqrt(max(covariance[0, 0], 0.0)))
+        direction = column.columns @ size
+        norm = float(np.linalg.norm(direction))
+        shifts = np.zeros(0) if column.taken is None else self.remainder.shifts(column.taken @ size)
+        return Score(
+            column.effect, gain, self._expected(column, size), float(size[0]), error, error * np.sqrt(24.0),
+            column.tolerance, direction / norm if norm > 0 else direction,
+            dict(zip(self.fitted.likelihood.names, shifts.tolist(), strict=False)),
+        )  # fmt: skip
 
     def _possible(self, column: _Column, size: Array) -> bool:
         """Return whether the expected size lies on a side of the neutral value on which there is any."""
@@ -506,8 +555,6 @@ def _carried(
 
 def _elongation_rate(run: Run, x: Array, model: GeneratedModel, fitted: StateSpaceFit) -> Array:
     """Return how fast the reading's elongation changes (n,), along the states expected, in the observable's unit."""
-    from srfcli.inference.prediction import run_parameters
-
     states = list(model.states)
     problem = fitted.likelihood.problem
     p = run_parameters(model, problem.experiment, run, problem.local(run, fitted.values))
@@ -522,8 +569,6 @@ def _elongation_rate(run: Run, x: Array, model: GeneratedModel, fitted: StateSpa
 
 
 def _rates_by_V(model: GeneratedModel, fitted: StateSpaceFit, run: Run, x: Array) -> Array:
-    from srfcli.inference.prediction import run_parameters
-
     problem = fitted.likelihood.problem
     p = run_parameters(model, problem.experiment, run, problem.local(run, fitted.values))
     W, W_dot = run.load(run.t)

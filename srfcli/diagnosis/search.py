@@ -22,17 +22,21 @@ import numpy as np
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
+from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.goodness_of_fit import shortcomings, taken_up
+from srfcli.diagnosis.goodness_of_fit import loudness, shortcomings, taken_up, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
-from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
+from srfcli.diagnosis.scores import ALIKE, Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
+    CLOSE_CALL,
     DEVIATION,
+    FARTHEST_STEP,
     FIELD,
     HOPELESS,
     NEEDED,
     NOT_CONVERGED,
+    TRIAL_STEPS,
     Likelihood,
     Maximum,
     Point,
@@ -56,20 +60,13 @@ from srfcli.laws.values import Effect
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, each at p = 1e-6
 CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
 MOST_EFFECTS = 2  # effects of a model
-ALIKE_EFFECTS = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
-UNDERSTATED = 2.0  # times the gain at first order that an effect may bring beside a model that is far off or has taken it up
 MOST_FOLLOWED = 5  # promises of each model that are followed
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 SEARCH_RTOL = 1e-3  # tolerance of the integration: 0.02 in log likelihood
 BUDGET = 150.0  # s of CPU, or more
 BASELINES = 5.0  # times what the baseline took, if that is more: two effects, each fitted twice, and what they leave to be scored
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
-LARGEST_SHIFT = 10.0  # in the logarithm of a parameter, that a score can move it: beyond any bounds
-BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
-RESIZED_BY = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
-AGAIN = 9  # of them, about the best, whose other parameters are fitted too where the model fails a test: 26 % apart
-STRIDES = 12  # steps of another ageing law from the file's own start values, or on from where it promises to be likelier
-HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
+BUILT, BUILT_SPAN = 16, 1e3  # sizes of what is built in, a mass or an interface, that are tried; the largest over the least
 FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
 
@@ -135,6 +132,7 @@ class _Move:
     fresh: int = field(compare=False, default=0)  # how many of the last effects are at sizes that are only expected
     direction: Array | None = field(compare=False, default=None)  # of what its last effect is expected to explain
     shifts: Mapping[str, float] = field(compare=False, default_factory=dict)  # of other parameters that go with that
+    origin: StateSpaceFit | None = field(compare=False, default=None)  # whose parameters it begins with, as they are
 
 
 class ModelSearch:
@@ -159,6 +157,8 @@ class ModelSearch:
         self.trend = trend or experiment.trend  # of every fit
         self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs))
         self.candidates, self.excluded = applicable(registry, experiment, effects)
+        every = [effect for e in registry.entries("effect") if isinstance(effect := registry.load(e), Effect)]
+        self.on_request = [e.name for e in every if effects is None and e.on_request]
         self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]
         self.budget, self.begun, self.cut_short = BUDGET, time.process_time(), False
         self.fitted: dict[str, Fitted] = {}
@@ -173,7 +173,7 @@ class ModelSearch:
         hypothesis = move.hypothesis if move else Hypothesis()
         options = {"processes": _colours(move.values) if move else None, "cautious": True, **self.options}
         if move:
-            options["least"] = self.baseline.fit.log_likelihood - HOPELESS
+            options["least"] = self.best().evidence - CLOSE_CALL
 
         def fitted(values: dict[str, float] | None) -> StateSpaceFit:
             return self._state_space(self._problem(hypothesis, values or {}), start=values, beside=False, **options)
@@ -183,14 +183,29 @@ class ModelSearch:
             found = fitted(self._started(replace(move, values=stated, shifts={})))
             if shortcomings(found):
                 found = max(found, fitted(self._started(move)), key=lambda f: f.log_likelihood)
+        elif move and move.origin:
+            found = self._as_it_is(move, move.origin.smooth, move.origin.likelihood.processes)
         else:
             found = fitted(self._started(move) if move else None)
+            if move and options["processes"] is None:  # what promised it had neither field nor colour
+                found = max(found, self._as_it_is(move, True, ()), key=lambda f: f.criterion)
         if move and "processes" not in self.options:
             found = with_less_colour(found, NEAR, self.progress)
         judged = self._judged(hypothesis, found)
         if move is None and judged.passes:  # else it is not what is reported
             judged = self._judged(hypothesis, likeliest_beside(found, NEAR, self.progress))
         return judged
+
+    def _as_it_is(self, move: _Move, smooth: bool, processes: Sequence[str]) -> StateSpaceFit:
+        """Return a fit that begins where a move says, under no wider field, without one if `smooth`, with colour as given."""
+        values = self._sized(move, 1.0, move.shifts)
+        problem, least = self._problem(move.hypothesis, values), self.best().evidence - CLOSE_CALL
+        likelihood = Likelihood(problem, smooth=smooth, processes=processes, rtol=SEARCH_RTOL)
+        begun = maximise(likelihood, likelihood.coordinates(values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
+        if not begun.promised > least:
+            return StateSpaceFit(likelihood, begun)
+        options = {"processes": None, "cautious": True, **self.options}
+        return self._state_space(problem, part=StateSpaceFit(likelihood, begun), **options)
 
     def _state_space(self, problem: Problem, **choice: Any) -> StateSpaceFit:
         return fit_state_space(problem, close=NEAR, rtol=SEARCH_RTOL, progress=self.progress, **choice)
@@ -226,7 +241,7 @@ class ModelSearch:
         model, values = move.hypothesis.model(self.registry, self.experiment), dict(move.values)
         for name, shift in shifts.items():  # relative ones as powers: what is positive stays so
             value = values[name]
-            power = np.clip(share * shift / value, -LARGEST_SHIFT, LARGEST_SHIFT) if value > 0 else 0.0
+            power = np.clip(share * shift / value, -FARTHEST_STEP, FARTHEST_STEP) if value > 0 else 0.0
             values[name] = value * float(np.exp(power)) if value > 0 else value + share * shift
         for number, (effect, sizes) in enumerate(zip(move.hypothesis.effects, move.sizes, strict=True)):
             part = share if number >= len(move.sizes) - move.fresh else 1.0
@@ -276,16 +291,22 @@ class ModelSearch:
     def run(self) -> Fitted:
         """Return the best model; `ranked` has all that were fitted."""
         self.progress("baseline")
-        base = self._record(self.fit(None))
+        base = self._with_own_noise(self._record(self.fit(None)))
         self.budget = max(BUDGET, BASELINES * (time.process_time() - self.begun))
+        if taken_up(base.fit):
+            self._fit_at_the_file()
         base = self._expand(base)
         if not base.passes:
             self._try_ageing_laws(base)
         self._search()
-        for further in (self._expand_without_field, self._refit_noise):  # dearer, or less likely
-            if not (self.best().passes or self.spent):
-                further(self.baseline)
-                self._search()
+        self._refit_elsewhere(base)
+        for node in (self.baseline, self.best()):
+            if self.best().name == base.name or not self.best().passes:
+                self._expand_without_field(node)
+        if not (self.best().passes or self.spent):
+            self._with_own_noise(self.best())
+            self._refit_noise(self.baseline)
+            self._search()
         if not self.spent:  # an effect, or the field beside the baseline, may pass for another ageing law
             self._try_ageing_laws(self.baseline, afresh=True)
             self._search()
@@ -303,6 +324,8 @@ class ModelSearch:
         if self.best().name != simplest.name:
             self._where_effects_act()
             self._eliminate()
+        if self.baseline.scores is None:  # from the best model's parameters it came to another maximum
+            self._expand(self.baseline)
         best = self.best()
         self.cut_short = self.spent and (not best.passes or self._promising(best) or self._expandable(best))
         if self.experiment.runs is not self.whole.runs:
@@ -375,8 +398,6 @@ class ModelSearch:
                 self._expect_elsewhere(move)
                 continue
             self._revise(move, found)
-            if found is self.best() and not found.passes:
-                self._refit_elsewhere(found)
 
     def _revise(self, move: _Move, found: Fitted) -> None:
         """Raise what is expected of effects that are like a fitted one at first order by what that gained beyond its promise."""
@@ -385,7 +406,7 @@ class ModelSearch:
             return
         for other in self.queue:
             own = other.direction
-            if own is not None and own.size == move.direction.size and abs(float(own @ move.direction)) > ALIKE_EFFECTS:
+            if own is not None and own.size == move.direction.size and abs(float(own @ move.direction)) > ALIKE:
                 other.expected -= surprise
         heapq.heapify(self.queue)
 
@@ -406,9 +427,8 @@ class ModelSearch:
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
         random = not node.fit.smooth or node.fit.likelihood.processes  # may have taken up what is missing
-        self._promise(node, node, self._gains(scores), WORTH if node.passes and not random else HINT)
-        for effect in (e for e in joining if e.settings or e.observed):
-            self._try_built_in(node, effect)
+        self._push(self._promised(node, node, self._gains(scores), WORTH if node.passes and not random else CLOSE))
+        self._push([m for e in joining if (e.settings or e.observed) and (m := self._built_in(node, e))])
         return node
 
     def _joining(self, node: Fitted) -> list[Effect]:
@@ -419,29 +439,39 @@ class ModelSearch:
 
     def _gains(self, scores: Scores) -> list[tuple[float, Score]]:
         """Return the effects' gains at first order, in all runs and in one alone."""
-        return [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in scores.alone]
+        return [(s.gain, s) for s in scores.every] + [(s.gain - self._rarer, s) for s in scores.alone]
 
-    def _promise(
+    def _promised(
         self, node: Fitted, at: Fitted, promised: Sequence[tuple[float, Score]], least: float, *, noise: bool = True
-    ) -> None:
-        """Push the effects that promise most beside those of `node`, by their gains (m,) at first order from the fit `at`.
+    ) -> list[_Move]:
+        """Return the effects that promise most beside those of `node`, by their gains (m,) at first order from the fit `at`.
 
         Unless its field and gauge `noise` are kept, they are estimated anew.
         """
+        moves = []
         for gain, score in sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])[:MOST_FOLLOWED]:
             hypothesis = Hypothesis((*node.hypothesis.effects, score.effect), node.hypothesis.ageing)
             sizes = (*self._sizes(at), score.values)
             own = {n: score.shifts[n] for n in at.fit.likelihood.problem.names if score.shifts.get(n)}
-            self._push(
-                node.attainable + gain + self._one_more, hypothesis, at, sizes, direction=score.direction, shifts=own, noise=noise
-            )
+            self.count += 1
+            values = {n: v for n, v in at.fit.values.items() if noise or not (n in FIELD or n.startswith("gauge_"))}
+            least_likely, fresh = at.fit.log_likelihood - HOPELESS, len(hypothesis.effects) - len(at.hypothesis.effects)
+            moves.append(_Move(
+                -(node.attainable + gain + self._one_more), self.count, hypothesis, values, sizes, least_likely, fresh,
+                direction=score.direction, shifts=own,
+            ))  # fmt: skip
+        return moves
+
+    def _push(self, moves: Sequence[_Move]) -> None:
+        for move in moves:
+            heapq.heappush(self.queue, move)
 
     def _expand_without_field(self, node: Fitted) -> None:
         """Push what effects promise from a fit without field and colour, where these have taken up what the model lacks.
 
         Under a field that no track has, the scores of what is missing are as low as those of what is not.
         """
-        if not taken_up(node.fit):
+        if self.spent or len(node.hypothesis.effects) == MOST_EFFECTS or not taken_up(node.fit):
             return
         problem = node.fit.likelihood.problem
         try:
@@ -452,8 +482,9 @@ class ModelSearch:
             return
         self.progress(f"{node.name}: scores without field and colour")
         scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, self._joining(node))
-        for promised in ([(s.gain, s) for s in scores.singles], [(s.gain - self._rarer, s) for s in scores.alone]):
-            self._promise(node, plain, promised, WORTH, noise=False)  # as many in one run alone as in all
+        for promised in ([(s.gain, s) for s in scores.every], [(s.gain - self._rarer, s) for s in scores.alone]):
+            self._push(self._promised(node, plain, promised, WORTH, noise=False))  # as many in one run alone as in all
+        self._search()
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""
@@ -464,26 +495,6 @@ class ModelSearch:
             for e in node.hypothesis.effects
         )
 
-    def _push(
-        self,
-        expected: float,
-        hypothesis: Hypothesis,
-        parent: Fitted,
-        sizes: tuple[dict[str, float], ...],
-        direction: Array | None = None,
-        shifts: Mapping[str, float] | None = None,
-        noise: bool = True,
-    ) -> None:
-        self.count += 1
-        fresh = len(hypothesis.effects) - len(parent.hypothesis.effects)
-        least = parent.fit.log_likelihood - HOPELESS
-        values = {n: v for n, v in parent.fit.values.items() if noise or not (n in FIELD or n.startswith("gauge_"))}
-        move = _Move(
-            -expected, self.count, hypothesis, values, sizes, least, fresh, direction=direction,
-            shifts=shifts or {},
-        )  # fmt: skip
-        heapq.heappush(self.queue, move)
-
     def _likelihood(self, hypothesis: Hypothesis, node: Fitted, name: str) -> Likelihood | None:
         """Return the likelihood of a model beside a fitted one; what cannot be joined is left out, with the reason."""
         try:
@@ -493,41 +504,66 @@ class ModelSearch:
             return None
         return Likelihood(problem, processes=node.fit.likelihood.processes, rtol=SEARCH_RTOL)
 
-    def _try_built_in(self, node: Fitted, effect: Effect) -> None:
-        """Push an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
+    def _built_in(self, node: Fitted, effect: Effect) -> _Move | None:
+        """Return an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
         hypothesis = Hypothesis((*node.hypothesis.effects, effect), node.hypothesis.ageing)
         likelihood = self._likelihood(hypothesis, node, effect.reported)
         if likelihood is None:
-            return
+            return None
         problem = likelihood.problem
         own = [n for n in problem.names if n not in node.fit.likelihood.problem.names]
         place = likelihood.names.index(own[0])
         x = likelihood.coordinates(_followable(node.fit.values, problem))
         low, high = (likelihood.values(edge)[own[0]] for edge in (likelihood.lower, likelihood.upper))
         trials = []
-        for size in np.geomspace(max(low, 1e-3 * high), high, BUILT):
+        for size in np.geomspace(max(low, high / BUILT_SPAN), high, BUILT):
             y = x.copy()
             y[place] = np.log(size) if likelihood.logarithmic[place] else size
             trials.append((likelihood.at(y, slopes=False).log_likelihood, y))
         best, x = max(trials, key=lambda t: t[0])
-        if np.isfinite(best):
-            found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
-            values = found.point.values
-            self.count += 1
-            gain = found.promised - node.fit.log_likelihood
-            if not gain > (WORTH if node.passes else 0.0):
-                return
-            expected = gain + node.attainable + self._one_more
-            sizes = (*self._sizes(node), {own[0]: values[own[0]]})
-            heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
+        if not np.isfinite(best):
+            return None
+        found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
+        gain = found.promised - node.fit.log_likelihood
+        if not gain > (WORTH if node.passes else 0.0):
+            return None
+        self.count += 1
+        values = dict(found.point.values)
+        sizes = (*self._sizes(node), {own[0]: values[own[0]]})
+        return _Move(-(gain + node.attainable + self._one_more), self.count, hypothesis, values, sizes)
 
-    def _refit_elsewhere(self, node: Fitted) -> None:
-        """Fit a model that fails a test anew where a scan, or another size of what is built in, leads somewhere likelier."""
-        found = self._scanned(node) or self._resized(node)
-        if found is not None and found.log_likelihood > node.fit.log_likelihood + NEEDED:
-            values = dict(found.values)
-            with contextlib.suppress(SrfError):  # else it stays as it was
-                self._record(self.fit(_Move(0.0, 0, node.hypothesis, values, self._sizes(node, values))))
+    def _fit_at_the_file(self) -> None:
+        """Fit the effect that promises most from the file's own start values.
+
+        A baseline that lacks something large makes up for it where its parameters should not be, and there the scores mislead.
+        """
+        likelihood = Likelihood(self._problem(Hypothesis(), {}), rtol=SEARCH_RTOL)
+        x = next(iter(wide_starts(likelihood, {}, self.progress)), None)
+        if x is None:
+            return
+        self.progress("scores at the start values")
+        found = StateSpaceFit(likelihood, maximise(likelihood, x, steps=0, widths=()))
+        node = Fitted(Hypothesis(), found, found.log_likelihood, 0.0, ("as it begins",), self.remainder(found))
+        scores = Scores(self.registry, likelihood.problem.experiment, node.remainder, (), self._joining(node))
+        wide = {n: found.values[n] for n in FIELD}
+        for move in self._promised(node, node, self._gains(scores), WORTH, noise=False)[:1]:
+            with contextlib.suppress(SrfError):  # it cannot be followed from there
+                self._record(self.fit(replace(move, values=move.values | wide)))
+
+    def _refit_elsewhere(self, base: Fitted) -> None:
+        """Fit the best model anew where a scan, or another size of what is built in, leads somewhere likelier.
+
+        And the one that is the best then, as long as it fails a test and is not the baseline.
+        """
+        tried = {base.name}
+        while not ((node := self.best()).name in tried or node.passes or self.spent):
+            tried.add(node.name)
+            found = self._scanned(node) or self._resized(node)
+            if found is not None and found.log_likelihood > node.fit.log_likelihood + NEEDED:
+                values = dict(found.values)
+                with contextlib.suppress(SrfError):  # else it stays as it was
+                    self._record(self.fit(_Move(0.0, 0, node.hypothesis, values, self._sizes(node, values))))
+            self._search()
 
     def _scanned(self, node: Fitted) -> Point | None:
         """Return the likeliest point that scans of parameters with narrow maxima lead to, None where it is no likelier."""
@@ -550,11 +586,13 @@ class ModelSearch:
         if name is None:
             return None
         trials, values = [], _followable(node.fit.values, likelihood.problem)
-        for ratio in np.geomspace(1 / RESIZED_BY, RESIZED_BY, AGAIN):
+        for ratio in BUILT_SPAN ** (np.arange(-4, 5) / 2 / (BUILT - 1)):  # two sizes to either side, by halves
             y = likelihood.coordinates({**values, name: values[name] * ratio})
-            trials.append(maximise(likelihood, y, held=[name], steps=STRIDES // 2, close=1.0, widths=(), progress=self.progress))
+            trials.append(
+                maximise(likelihood, y, held=[name], steps=TRIAL_STEPS // 2, close=1.0, widths=(), progress=self.progress)
+            )
         likeliest = max(trials, key=lambda f: f.point.log_likelihood)
-        return maximise(likelihood, likeliest.point.x, steps=STRIDES, close=1.0, widths=(), progress=self.progress).point
+        return maximise(likelihood, likeliest.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress).point
 
     def _refit_noise(self, base: Fitted) -> None:
         """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""
@@ -568,6 +606,31 @@ class ModelSearch:
                     self._refitted(node, processes)
             self.queue.clear()
 
+    def _with_own_noise(self, node: Fitted) -> Fitted:
+        """Return a fitted model with a gauge noise for each run, as all models have from then on, where runs differ in it.
+
+        That is where one noise is too large for one run and too small for another, evidence rises, and none is louder then than
+        its recording shows.
+        """
+        if not uneven_noise(node.fit):
+            return node
+        before = self.experiment, self.whole
+        self.experiment, self.whole = (
+            replace(e, vary=(*e.vary, GAUGE_NOISE), by=e.by if e.vary else "run") for e in before
+        )  # fmt: skip
+        problem = self._problem(node.hypothesis, node.fit.values)
+        found = self._state_space(problem, start=_followable(node.fit.values, problem), **{**self.options, "cautious": True})
+        loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
+        if loud or log_evidence(found) < log_evidence(node.fit) + CLOSE:
+            self.experiment, self.whole = before
+            return node
+        others = [f for f in (self.baseline, *self.ranked()[:MOST_FOLLOWED]) if f.name != node.name]
+        self._record(self._judged(node.hypothesis, found), anew=True)
+        for other in others:
+            self._refitted(other, found.likelihood.processes)
+        self.queue.clear()
+        return self.fitted[node.name]
+
     def _refitted(self, node: Fitted, processes: Sequence[str] | None) -> Fitted:
         """Return a fitted model with other gauge noise, which takes its place."""
         problem = node.fit.likelihood.problem
@@ -579,18 +642,42 @@ class ModelSearch:
             return node
 
     def _try_rivals(self) -> None:
-        """Push what may do as well in the place of one effect of the best model: by UNDERSTATED times what it promised there."""
+        """Fit what does the same at first order in the place of one effect of the best model, or of its ageing law.
+
+        The best model absorbs such an effect, and what is left of the best without its own does not. An ageing law is as likely
+        at the parameters of the best.
+        """
         best = self.best()
-        effects, ageing = best.hypothesis.effects, best.hypothesis.ageing
-        rests = [Hypothesis(tuple(e for e in effects if e is not left_out), ageing) for left_out in effects]
-        rests += [Hypothesis(effects)] if ageing else []
-        for rest in rests if best.passes else ():
-            node = self.fitted.get(rest.name)
-            if node is None or node.scores is None:
+        effects, ageing, sizes = best.hypothesis.effects, best.hypothesis.ageing, self._sizes(best)
+        if not best.passes or best.scores is None:
+            return
+        for i, effect in enumerate(effects):
+            others, own = effects[:i] + effects[i + 1 :], sizes[:i] + sizes[i + 1 :]
+            node = self.fitted.get(Hypothesis(others, ageing).name)
+            for score in best.scores.absorbed(node.scores) if node and node.scores else []:
+                hypothesis = Hypothesis((*others, score.effect), ageing)
+                if hypothesis.name not in self.fitted:
+                    self._fit_from(best, hypothesis, (*own, self._instead(effect, score, best)))
+        for law in self.laws if ageing else []:
+            hypothesis = Hypothesis(effects, "+".join([law, *ageing.split("+")[1:]]))
+            likelihood = None if hypothesis.name in self.fitted else self._likelihood(hypothesis, best, law)
+            if law == self.experiment.choice.ageing.partition("+")[0] or likelihood is None:
                 continue
-            beside = [(gain, s, Hypothesis((*rest.effects, s.effect), rest.ageing)) for gain, s in self._gains(node.scores)]
-            rivals = [(UNDERSTATED * gain, s) for gain, s, hypothesis in beside if hypothesis.name not in self.fitted]
-            self._promise(node, node, rivals, WORTH)
+            x = likelihood.coordinates(best.fit.values)
+            if likelihood.at(x, slopes=False).log_likelihood > best.fit.log_likelihood - WORTH:
+                self._fit_from(best, hypothesis, sizes)
+
+    def _instead(self, effect: Effect, score: Score, node: Fitted) -> dict[str, float]:
+        """Return the size of what is scored that does at first order what an effect of a fitted model does."""
+        model, fitted = node.fit.likelihood.problem.model, node.fit.values
+        names = {p.name: long for long, p in own_parameters(effect, model).items()} | {n: n for n in effect.frees}
+        size, *_ = (*effect.sizes, *effect.frees)
+        still = neutral_values(effect).get(size, self.experiment.stiffness)
+        moved = score.shifts.get(names[size], 0.0)
+        ratio = -(fitted[names[size]] - still) / moved if moved else 1.0
+        first, *_ = (*score.effect.sizes, *score.effect.frees)
+        begun = neutral_values(score.effect).get(first, fitted.get("K", self.experiment.stiffness))
+        return {**score.values, first: begun + ratio * score.size}
 
     def _try_ageing_laws(self, node: Fitted, *, afresh: bool = False) -> None:
         """Push the other ageing laws, each after a few steps from where the model or the best one stands.
@@ -618,7 +705,7 @@ class ModelSearch:
                 places.append(maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress))
             if afresh and self.experiment.runs:
                 start = self._at_the_file(likelihood, hypothesis, best.fit.values)
-                places.append(maximise(likelihood, start, steps=STRIDES, close=1.0, progress=self.progress))
+                places.append(maximise(likelihood, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress))
             self._tried[name] = x
             found = max(places, key=lambda m: m.promised, default=None)
             if found is not None and found.promised > least:
@@ -626,7 +713,7 @@ class ModelSearch:
         reached.sort(key=lambda r: -r[0])
         for number, (promise, hypothesis, likelihood, found) in enumerate(reached):
             if number == 0 and found.away > NEAR:
-                found = maximise(likelihood, found.point.x, steps=STRIDES, close=1.0, widths=(), progress=self.progress)
+                found = maximise(likelihood, found.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
                 promise = found.promised
             self.count += 1
             expected = promise - node.fit.log_likelihood + node.attainable
@@ -658,33 +745,37 @@ class ModelSearch:
                 one = Hypothesis((*effects[:i], replace(effect, run=run.name), *effects[i + 1 :]), ageing)
                 own = best.fit.likelihood.beside(self._problem(one, best.fit.values))
                 heights.append((own.at(own.coordinates(best.fit.values), slopes=False).log_likelihood, run.name, one))
-            likeliest, _, one = max(heights)
+            likeliest, _, one = max(heights, key=lambda h: h[0])
             if likeliest > best.fit.log_likelihood - WORTH and one.name not in self.fitted:
                 self._fit_from(best, one, self._sizes(best))
 
     def _fit_from(self, node: Fitted, hypothesis: Hypothesis, sizes: tuple[dict[str, float], ...]) -> None:
         """Fit a model from the parameters of another that was fitted; what cannot be fitted is left out, with the reason."""
         try:
-            self._record(self.fit(_Move(0.0, 0, hypothesis, dict(node.fit.values), sizes)))
+            self._record(self.fit(_Move(0.0, 0, hypothesis, dict(node.fit.values), sizes, origin=node.fit)))
         except SrfError as error:
             self.excluded.append(Excluded(hypothesis.name, error.message))
 
     def _eliminate(self) -> None:
-        """Refit the best model, and what comes close, with fewer parts from its parameters (backward elimination).
+        """Refit the best model, and what comes close, with one part less from its parameters (backward elimination).
 
-        Each effect of a pair alone, and effects beside another ageing law under the stated one.
+        Of several parts each is left out, and what the best has of one: a fit from the file may have ended at a lower maximum.
         """
-        for node in [f for f in self.ranked() if len(f.hypothesis.reported) > 1]:
-            top = self.best().evidence
-            if node.evidence < top - CLOSE:
-                break
+        asked: set[str] = set()
+        while node := next((f for f in self.ranked() if f.hypothesis.reported and f.name not in asked), None):
+            asked.add(node.name)
+            best = self.best()
             effects, ageing, sizes = node.hypothesis.effects, node.hypothesis.ageing, self._sizes(node)
+            if node.evidence < best.evidence - CLOSE:
+                break
             parts = [(Hypothesis(effects), sizes)] if ageing else []
-            if len(effects) > 1:
-                parts += [(Hypothesis((e,), ageing), (own,)) for e, own in zip(effects, sizes, strict=True)]
+            for i in range(len(effects)):
+                parts.append((Hypothesis(effects[:i] + effects[i + 1 :], ageing), sizes[:i] + sizes[i + 1 :]))
             for part, own in parts:
                 known = self.fitted.get(part.name)
-                if known is not None and known.passes and known.evidence > top - CLOSE:
+                if known is not None and known.passes and known.evidence > best.evidence - CLOSE:
+                    continue
+                if not part.reported and node is not best:
                     continue
                 if any(n not in self._stated for e in part.effects for n in e.needs):
                     continue  # it is nothing without the other
@@ -701,7 +792,8 @@ class ModelSearch:
         text = f"log evidence {found.separate:.1f}" + (f", but {found.against[0]}" if found.against else "")
         self.progress(f"{name}: {text}")
         if known is None or anew or found.separate > known.separate:
-            self.fitted[name] = found
+            same = known is not None and not anew and found.separate - known.separate < NEEDED
+            self.fitted[name] = replace(found, scores=known.scores) if known is not None and same else found
             self._grant_shared_field()
         return self.fitted[name]
 

@@ -8,19 +8,27 @@ from typing import Any
 
 import numpy as np
 
-from srfcli.core.errors import Status
+from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
+from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.goodness_of_fit import improbability, loudness, uneven_noise
-from srfcli.diagnosis.hypotheses import Excluded, typical_sizes
-from srfcli.diagnosis.scores import Remainder, Score
-from srfcli.diagnosis.search import CLOSE, NEAR, Fitted, ModelSearch
+from srfcli.diagnosis.goodness_of_fit import improbability, loudness, shortcomings, uneven_noise
+from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, typical_sizes
+from srfcli.diagnosis.scores import ALIKE, Remainder, Score, own_values
+from srfcli.diagnosis.search import CLOSE, NEAR, SEARCH_RTOL, WORTH, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.state_space import NEEDED, Filtered, Predictive, StateSpaceFit, maximise
+from srfcli.inference.state_space import (
+    NEEDED,
+    Filtered,
+    Predictive,
+    StateSpaceFit,
+    fit_state_space,
+    log_evidence,
+    maximise,
+)  # fmt: skip
 
 BASELINE_VERDICTS = ("none", "inconclusive")  # verdicts whose final model is the baseline
 HELD_OUT_RMS = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
-ONE_CLASS = 0.97  # likeness of two effects' projected columns beyond which they are one class
 ABSORBED_SHARE = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
 BEHIND = 50.0  # in log evidence, by how much a model may be behind and still be asked what it predicts
 TEMPER = 3.0  # by which log evidence is divided before it becomes a stated confidence
@@ -124,6 +132,9 @@ class Diagnosis:
 def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     """Return the verdict on a finished search; `whole` is the experiment with its held-out runs, opened only now."""
     ranked = tuple(search.ranked())
+    own_noise = GAUGE_NOISE in set(search.whole.vary) - set(whole.vary)
+    if own_noise:
+        whole = replace(whole, vary=search.whole.vary, by=search.whole.by)
     baseline, best = search.baseline, ranked[0]
     close, joint, became = may_be_it(ranked, whole)
     best = close[0] if close else best
@@ -136,9 +147,20 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     if refused:
         reasons.append(refused)
     elif verdict == "unknown":
-        reasons += uneven_noise(best.fit)
+        reasons += uneven_noise(best.fit) + unsteady_start(search, best)
+    doubtful = verdict == "unknown" or (verdict == "identified" and any(e.run for e in best.hypothesis.effects))
+    if doubtful:
+        reasons += not_the_same(baseline, best if verdict == "identified" else baseline)
+    if verdict not in BASELINE_VERDICTS:
+        reasons += [f"{run.name}: {n}" for run in search.whole.runs for n in run.notices if n.kind == "drive-steps"]
+    if doubtful and search.on_request:
+        reasons.append(
+            f"not tried, as they are looked for where they are named alone: {', '.join(search.on_request)}; --effect NAME"
+        )
     if whole.runs and not baseline.fit.likelihood.problem.runs:
         reasons.append("held-out runs are not judged, as no run was fitted that would tell the gauge's noise")
+    if own_noise:
+        reasons.append(f"each {whole.by} was given a gauge noise of its own, as no one noise is that of all")
     reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]
     if search.cut_short:
         reasons.append(f"the search ended at its budget of {search.budget:.0f} s of CPU, with models left to fit")
@@ -155,6 +177,35 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
         _equivalent(scores, close, ranked, joint), held,
         tuple(reasons), ungated, held_loads, became,
     )  # fmt: skip
+
+
+def unsteady_start(search: ModelSearch, best: Fitted) -> list[str]:
+    """Return what to try where the baseline explains more than the best model from a start that is no steady sliding."""
+    experiment = search.experiment
+    if search.spent or all(run.initial == "free" for run in experiment.runs):
+        return []
+    runs = tuple(replace(run, initial="free") for run in experiment.runs)
+    problem = Hypothesis().problem(search.registry, replace(experiment, runs=runs), trend=search.trend)
+    try:
+        found = fit_state_space(problem, cautious=True, beside=False, close=NEAR, rtol=SEARCH_RTOL)
+    except SrfError:
+        return []
+    gain = log_evidence(found) - best.separate
+    then = "" if shortcomings(found) else ", and every test is passed"
+    said = f'the baseline with initial = "free", the state at the first sample estimated, gains {gain:.0f} in log evidence{then}'
+    return [said] if gain > CLOSE else []
+
+
+def not_the_same(baseline: Fitted, best: Fitted) -> list[str]:
+    """Return which parameter of the baseline differs in one run, where that gains more at first order than what was found."""
+    own = next(iter(own_values(baseline.remainder)), None)
+    gains = [s.gain for s in baseline.promised] + [s.gain for s in (baseline.scores.alone if baseline.scores else ())]
+    least = max(gains, default=0.0) if best is not baseline else WORTH
+    if own is None or own.gain < max(least, WORTH):
+        return []
+    value = baseline.fit.values[own.parameter]
+    said = f"{own.parameter} of {own.run} alone, about {value + own.change:.3g} where the baseline has {value:.3g}"
+    return [f"{said}, would gain {own.gain:.0f} in log likelihood: --vary {own.parameter}"]
 
 
 def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted, ...], dict[str, float], dict[str, str]]:
@@ -213,8 +264,12 @@ def _count_of_parameters(fitted: Fitted) -> int:
 
 
 def _is_that_law(fitted: Fitted, other: Fitted, evidence: Mapping[str, float]) -> bool:
-    """Return whether a model became what another ageing law is that has fewer parameters: the innovations are the same."""
-    if not other.hypothesis.ageing or other.hypothesis.effects or other is fitted:
+    """Return whether a model became what another ageing law is that has fewer parameters: the innovations are the same.
+
+    Either without effects or beside the same ones.
+    """
+    beside = other.hypothesis.reported[1:]
+    if not other.hypothesis.ageing or other is fitted or (beside and beside != fitted.hypothesis.reported[1:]):
         return False
     more, less = (_count_of_parameters(f) for f in (fitted, other))
     if more <= less or evidence[fitted.name] - evidence[other.name] > (more - less) * np.log(2):  # each halves the prior
@@ -346,7 +401,7 @@ def _equivalent(
     for i, a in enumerate(scores):
         for b in scores[i + 1 :]:
             one, other = a.effect.reported, b.effect.reported
-            alike = ({one, other} & names or not names) and abs(float(a.direction @ b.direction)) > ONE_CLASS
+            alike = ({one, other} & names or not names) and abs(float(a.direction @ b.direction)) > ALIKE
             if alike and not (apart(one, other) or apart(other, one)):
                 found.append((one, other))
     return tuple(found)

@@ -61,7 +61,7 @@ LEAST_FIELD = 1e-6  # the least amplitude of a field, over the friction of the r
 FAINT_FIELD = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
 FAINT_FIELDS = (0.03, 0.1, 0.3, 1.0)  # amplitudes over FAINT_FIELD, that are tried beside a fit without a field
 FIELD_STEPS = 6  # of the trial of a small field beside a fit without one: parameters that are off may hide it
-BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
+TRIAL_STEPS = 12  # of scoring from another start, to see whether it leads to a likelier maximum
 FIELD_SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
 NEEDED = 2.0  # gain in log likelihood that keeps a field, or one that all runs share, and from which a maximum is another one
 CLOSE_CALL = 50.0  # in log likelihood, by which a fit that was broken off early may be behind and still be finished
@@ -776,7 +776,6 @@ def maximise(
             break
         bent = winding
         while damping < 1e8:
-            x = point.x.copy()
             move = directions @ (steep / (size + damping)) / d
             if winding and not width:
                 bend = directions @ ((directions.T @ (_pull(likelihood, point, moving, move) / d)) / (size + damping)) / d
@@ -784,6 +783,7 @@ def maximise(
                 winding, part = turn > STRAIGHT, min(TURN / max(turn, TURN), 1.0)
                 move = part * move + part**2 * bend / 2
             move = np.where(likelihood.logarithmic[moving], np.clip(move, -FARTHEST_STEP, FARTHEST_STEP), move)
+            x = point.x.copy()
             x[moving] += move
             trial = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper), slopes=sure, like=point)
             gain = _gain(trial, point, weights)
@@ -1187,10 +1187,7 @@ def _on_all(
     if processes is None:
         best = _with_colour(best, likelihood, progress, cautious)
     if smooth is None and best.smooth:
-        rough = likelihood(False, best.likelihood.processes)
-        small = _small_field(rough, best.maximum.point)
-        if small is not None:
-            best = StateSpaceFit(rough, replace(best.maximum, point=small))
+        best = _beside_small_field(best, likelihood)
     settled = best.likelihood is whole and best.maximum.away < close
     return best if settled else _with_or_without(best, smooth, likelihood, close, progress)
 
@@ -1233,10 +1230,10 @@ def _fitted(
     best = StateSpaceFit(wide, found)
     if found.status is Status.INTEGRATION:
         return best
-    if found.point.log_likelihood < least:
+    if found.promised < least:
         found = maximise(wide, found.point.x, close=close, progress=progress) if np.isinf(found.away) else found
         best = StateSpaceFit(wide, found)
-        if found.point.log_likelihood < least:
+        if found.promised < least:
             return best
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
     best = first = _with_colour(best, likelihood, progress, cautious) if processes is None else best
@@ -1259,7 +1256,9 @@ def _fitted(
             if other.criterion > best.criterion - CLOSE_CALL:
                 own = maximise(instead, other.maximum.point.x, close=close, progress=progress)
                 other = StateSpaceFit(instead, own)
-            best = other if other.criterion > best.criterion else best
+            if other.criterion > best.criterion:  # beside the colour there may be another, smaller field
+                best = _beside_small_field(other, likelihood)
+                best = best if best.smooth else _with_or_without(best, smooth, likelihood, close, progress)
     if fresh:
         best = likeliest_beside(best, close, progress) if beside else best
     if fresh and smooth is None and best.smooth:
@@ -1621,7 +1620,7 @@ def _with_or_without(
         if found.point.x[at] < last[at] - FIELD_SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
             found = replace(found, point=_shrunk(rough, found.point, at))
         if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
-            tried = bare(BARE_STEPS)
+            tried = bare(TRIAL_STEPS)
             if tried.log_likelihood > found.point.log_likelihood and tried.maximum.away < close:
                 small = _small_field(rough, tried.maximum.point)
                 if small is None:
@@ -1637,13 +1636,20 @@ def _with_or_without(
         if smooth or there > found.point.log_likelihood - HOPELESS:
             tried = bare(SCORING_STEPS)
         elif found.point.x[at] < faint:  # an oscillation is integrated more closely, so that its narrow maximum is next to this
-            tried = bare(BARE_STEPS)
+            tried = bare(TRIAL_STEPS)
     if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
         return best
     if tried.maximum.away < close:
         return tried
     own = maximise(plain, tried.maximum.point.x, close=close, progress=progress)
     return StateSpaceFit(plain, own)
+
+
+def _beside_small_field(fitted: StateSpaceFit, likelihood: Callable[[bool, Sequence[str]], Likelihood]) -> StateSpaceFit:
+    """Return where a small field beside a fit without one leads, yet to be maximised; the fit where it gains too little."""
+    rough = likelihood(False, fitted.likelihood.processes)
+    small = _small_field(rough, fitted.maximum.point)
+    return fitted if small is None else StateSpaceFit(rough, replace(fitted.maximum, point=small))
 
 
 def _small_field(rough: Likelihood, bare: Point) -> Point | None:
@@ -1740,20 +1746,23 @@ def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Arra
 
 
 def wide_starts(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> list[Array]:
-    """Return x at `start` under a few wide fields, the likeliest first: there the filter stays with the recording."""
+    """Return x at `start` under a few wide fields, the likeliest first: there the filter stays with the recording.
+
+    The widest is tried first, and what takes MOST_WORK times the steps of the likeliest so far is none.
+    """
     x = rough.coordinates(start)
     if "field_amplitude" in start:
         return [x]
     amplitude, length = (rough.names.index(n) for n in FIELD)
-    trials: list[tuple[float, Array]] = []
-    for wide in WIDE:
-        for short in SHORT:
-            trial = _under_field(rough, x, wide, short)
-            found = rough.at(trial, slopes=False).log_likelihood
-            progress(f"field of {np.exp(trial[amplitude]):.2g} over {np.exp(trial[length]):.2g} um: log likelihood {found:.1f}")
-            if np.isfinite(found):
-                trials.append((found, trial))
-    return [trial for _, trial in sorted(trials, key=lambda t: -t[0])]
+    trials: list[Point] = []
+    for wide, short in product(reversed(WIDE), SHORT):
+        best = max(trials, key=lambda p: p.log_likelihood, default=None)
+        trial = rough.at(_under_field(rough, x, wide, short), slopes=False, like=best)
+        field = f"field of {np.exp(trial.x[amplitude]):.2g} over {np.exp(trial.x[length]):.2g} um"
+        progress(f"{field}: log likelihood {trial.log_likelihood:.1f}")
+        if np.isfinite(trial.log_likelihood):
+            trials.append(trial)
+    return [trial.x for trial in sorted(trials, key=lambda p: -p.log_likelihood)]
 
 
 def _elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:

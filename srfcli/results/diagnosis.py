@@ -18,7 +18,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
 from srfcli.diagnosis.answer import RunView, answer, load_views, material, parameter_rows, ranked_rows, run_views
 from srfcli.diagnosis.design import DiscriminatingRun, discriminating_files
-from srfcli.diagnosis.verdict import added
+from srfcli.diagnosis.verdict import added, at_bounds
 from srfcli.results.provenance import Provenance, write_result
 from srfcli.results.report_figures import loads_figure, run_figure, trace
 from srfcli.results.report_text import unit_text
@@ -120,7 +120,9 @@ class DiagnosisResult(Result):
         named = [f"{name} in {alone[name]} alone" if name in alone else name for name in self.effects]
         if self.verdict == "identified":
             named = [f"the ageing law is {name}, not {stated}" if name in laws else name for name in named]
-        return SENTENCES[self.verdict].format(" and ".join(named))
+        bounds = at_bounds(self.diagnosis.final)
+        beside = f"; {', '.join(bounds)} at {'its bound' if len(bounds) == 1 else 'their bounds'}: widen" if bounds else ""
+        return SENTENCES[self.verdict].format(" and ".join(named)) + beside
 
     @property
     def status(self) -> Status:

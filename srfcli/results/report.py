@@ -285,20 +285,13 @@ def hypotheses(matter: Matter) -> Markup:
     ranked = [r for r in matter.rows("ranked") if finite(r.get("evidence"))]
     if not ranked:
         return Markup("")
-    top, verdict = max(r["evidence"] for r in ranked), matter.answer.get("verdict")
-    told = set(matter.answer.get("effects") or ())
-    confidence = matter.answer.get("confidence") or {}
-    rows, chosen = [], []
-    for k, r in enumerate(ranked):
-        names = set(str(r["name"]).split("+"))
-        if (verdict == "identified" and k == 0) or (verdict == "ambiguous" and names <= told):
-            chosen.append(k)
-        if verdict in ("none", "inconclusive") and r["name"] == "none":
-            chosen.append(k)
+    top = max(r["evidence"] for r in ranked)
+    rows, chosen = [], [k for k, r in enumerate(ranked) if r.get("told")]
+    for r in ranked:
         label = "the baseline alone" if r["name"] == "none" else r["name"]
-        sure = confidence.get("+".join(sorted(names)), r.get("confidence"))
         evidence, field = number(r["evidence"] - top), number(r.get("field") or 0.0, 2)
-        rows.append([label, evidence, rms(r["rms_over_noise"]), field, percent(sure), r.get("against") or ""])
+        sure = percent(r.get("confidence"))
+        rows.append([label, evidence, rms(r["rms_over_noise"]), field, sure, r.get("against") or ""])
     caption = (
         "Everything that was fitted in full, best first: log evidence against the best, innovations over noise, the amplitude of "
         "the random friction that it needs besides, and what speaks against it."
@@ -546,7 +539,7 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     um/s, and of baseline and augmented model: white, rms, friction;
     thresholds: {name, holdout, table, baseline, augmented, chi2 (of both models)}, critical loads (n,) in N;
     residual_scan: {axis, run, kind, low, high, log_p, p_value};
-    ranked: {name, evidence, rms_over_noise, field, confidence, against};
+    ranked: {name, evidence, rms_over_noise, field, confidence, against, told (whether it is what the verdict says)};
     scores: {effect, gain, size, stderr, tolerance, detectable};
     parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma};
     and, where there are any, alternatives: each model of an ambiguous verdict, with its parameters, as text; discriminating:

@@ -147,16 +147,13 @@ def gain_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str
         return f"With the model as it is{level}{f'; {track}' if track else ''}." if level else ""
     ranked = [r for r in material.get("ranked", ()) if finite(r.get("evidence"))]
     zero = next((r["evidence"] for r in ranked if r.get("name") == "none"), None)
-    name = "+".join(sorted(str(e) for e in answer.get("effects", ())))
-    own = next((r["evidence"] for r in ranked if "+".join(sorted(str(r["name"]).split("+"))) == name), None)
-    best = own if own is not None else max((r["evidence"] for r in ranked), default=None)
+    told = next((r for r in ranked if r.get("told")), None) if verdict == "identified" else None
     parts = [f"{'With the best that was tried, ' if verdict in ('unknown', 'ambiguous') else ''}{_fell(answer)}"]
-    if verdict == "identified" and zero is not None and best is not None and best > zero:
-        parts.append(f"the log evidence rises by {number(best - zero)}")
+    if told and zero is not None and told["evidence"] > zero:
+        parts.append(f"the log evidence rises by {number(told['evidence'] - zero)}")
     parts += [track] if track else []
-    sure = (answer.get("confidence") or {}).get(name)
-    if verdict == "identified" and finite(sure):
-        parts.append(f"confidence {percent(sure)}")
+    if told and finite(told.get("confidence")):
+        parts.append(f"confidence {percent(told['confidence'])}")
     runs = len([r for r in material.get("runs", ()) if not r.get("holdout")])
     located = [r for r in (answer.get("location") or {}).get("runs", ()) if finite(r.get("share"))]
     rests = f"It rests on {runs} fitted run{'s' if runs != 1 else ''}" if runs else ""
