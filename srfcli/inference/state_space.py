@@ -84,6 +84,7 @@ DOWN = 10.0  # in log likelihood, by how much less likely than without a field a
 NEIGHBOUR_STEPS = (16, 64)  # of two standard errors to either side, least and most, in which other maxima are looked for
 HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
+UNFELT = 1e-6  # twice the log likelihood that a parameter changes between its bounds, below which its score is rounding
 FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
 BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
 CONVERGED = 0.1  # standard errors: how far the maximum may still be, by the gradient
@@ -762,11 +763,11 @@ def maximise(
                 score, information, weights = _weighted(likelihood, point, width, free)
             moving = np.nonzero(free & ~(low & (score < 0)) & ~(high & (score > 0)))[0]
             g, I = score[moving], (information + more)[np.ix_(moving, moving)]
-            d = np.sqrt(np.maximum(np.diag(I), 1e-300))
-            size, directions = np.linalg.eigh(I / np.outer(d, d))
-            size, directions = size[size > FLAT], directions[:, size > FLAT]
+            d, size, directions = _scaled(I)
             steep = directions.T @ (g / d)
-            away = float(np.sqrt(np.sum(steep**2 / size)))
+            felt = np.diag(I) * (likelihood.upper - likelihood.lower)[moving] ** 2 > UNFELT
+            wide, power, along = (d, size, directions) if felt.all() else _scaled(I[np.ix_(felt, felt)])
+            away = float(np.sqrt(np.sum((along.T @ (g[felt] / wide)) ** 2 / power)))
             if not width or (away > np.sqrt(moving.size) and slow < 2):  # farther than chance would have it
                 break
             left, slow, damping = left[1:], 0, 1e-3
@@ -815,6 +816,13 @@ def maximise(
     covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound)[0]
     covariance[np.ix_(inner, inner)] = inverse(point.information[np.ix_(inner, inner)])
     return Maximum(point, away, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE, covariance)
+
+
+def _scaled(information: Array) -> tuple[Array, Array, Array]:
+    """Return the roots d (m,) of an information's diagonal, and its eigenvalues (p,) and directions (m, p) over these."""
+    d = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    size, directions = np.linalg.eigh(information / np.outer(d, d))
+    return d, size[size > FLAT], directions[:, size > FLAT]
 
 
 def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Point:
