@@ -300,9 +300,10 @@ class ModelSearch:
             self._try_ageing_laws(base)
         self._search()
         self._refit_elsewhere(base)
-        for node in (self.baseline, self.best()):
-            if self.best().name == base.name or not self.best().passes:
-                self._expand_without_field(node)
+        if self.best().name == base.name or not self.best().passes:
+            self._expand_without_field(self.baseline)
+        if self.best().name != base.name and not self.best().passes:
+            self._expand_without_field(self.best())
         if not (self.best().passes or self.spent):
             self._with_own_noise(self.best())
             self._refit_noise(self.baseline)
@@ -612,7 +613,7 @@ class ModelSearch:
         That is where one noise is too large for one run and too small for another, evidence rises, and none is louder then than
         its recording shows.
         """
-        if not uneven_noise(node.fit):
+        if GAUGE_NOISE in self.experiment.vary or not uneven_noise(node.fit):
             return node
         before = self.experiment, self.whole
         self.experiment, self.whole = (
