@@ -28,8 +28,8 @@ from srfcli.diagnosis.search import Fitted, ModelSearch
 from srfcli.laws.registry import bundled_registry
 
 MOVES = (
-    "_expand", "_try_built_in", "_try_ageing_laws", "_expand_without_field", "_refit_noise", "_try_rivals", "_where_effects_act",
-    "_eliminate", "_refit_elsewhere", "_fit_all",
+    "_expand", "_fit_at_the_file", "_with_own_noise", "_try_ageing_laws", "_expand_without_field", "_refit_noise", "_try_rivals",
+    "_where_effects_act", "_eliminate", "_refit_elsewhere", "_fit_all",
 )  # fmt: skip
 
 

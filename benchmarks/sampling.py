@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import emcee
 import numpy as np
@@ -74,9 +75,9 @@ def ridge(k: int, bend: float) -> Target:
 
 def of_fit(name: str, folder: Path, **options: str) -> Target:
     found = srf.fit(srf.read_experiment(folder), **options).found  # type: ignore[arg-type]
-    problem, best = found.problem, np.array([found.fit.values[n] for n in found.problem.names])
-    log_posterior = posterior._log_posterior(problem, found.fit, found.state_space)
-    return Target(name, log_posterior, best, found.fit.covariance, problem.lower, problem.upper)
+    with patch.object(posterior, "draw", lambda *given, **more: given):  # what `sample` would draw from
+        log_posterior, _, best, covariance, (lower, upper), _ = posterior.sample(found.state_space, 1)
+    return Target(name, log_posterior, best, covariance, lower, upper)
 
 
 def simulated(folder: Path) -> Target:
