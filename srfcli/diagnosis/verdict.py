@@ -272,7 +272,7 @@ def _is_that_law(fitted: Fitted, other: Fitted, evidence: Mapping[str, float]) -
     if not other.hypothesis.ageing or other is fitted or (beside and beside != fitted.hypothesis.reported[1:]):
         return False
     more, less = (_count_of_parameters(f) for f in (fitted, other))
-    if more <= less or evidence[fitted.name] - evidence[other.name] > (more - less) * np.log(2):  # each halves the prior
+    if more <= less or evidence[fitted.name] - evidence[other.name] > NEEDED:
         return False
     whites = zip(fitted.fit.maximum.point.runs, other.fit.maximum.point.runs, strict=True)
     return float(sum(np.sum((a.white - b.white) ** 2) for a, b in whites)) < 2 * CLOSE

@@ -87,6 +87,7 @@ FLAT = 1e-8  # of the scaled information: a direction that is flatter has a scor
 UNFELT = 1e-6  # twice the log likelihood that a parameter changes between its bounds, below which its score is rounding
 FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
 BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
+CREEP = 0.01  # share of what the score promises that a step must gain where readings are weighted, or they are weighted otherwise
 CONVERGED = 0.1  # standard errors: how far the maximum may still be, by the gradient
 TOLD = 2.0  # standard errors from the maximum to which a fit is moved for a run that it did not know: 2 in log likelihood
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
@@ -741,7 +742,7 @@ def maximise(
     """Return the maximum from x (k,), by Fisher scoring with Levenberg's damping; parameters `held` stay where they are.
 
     Readings and critical loads are weighted first, by how far each tells something, `widths` one after the other (WIDTHS), and
-    then all count alike.
+    then all count alike, from where the weights led or, if that is likelier, from a point that was passed on the way.
     It ends within `close` standard errors of the maximum, by the score, or where two steps running each gain less than a quarter
     of what that distance is worth. Parameters that a step would push out stay at their
     bounds. A likelihood that cannot be evaluated at x is a status.
@@ -751,6 +752,7 @@ def maximise(
     if not np.isfinite(point.log_likelihood):
         return Maximum(point, np.inf, Status.INTEGRATION, np.full((x.size, x.size), np.nan))
     away, sure, slow, more, left = np.inf, True, 0, np.zeros((x.size, x.size)), [*(WIDTHS if widths is None else widths), 0.0]
+    best = point  # of those that were passed
     winding = False  # whether straight steps go to and fro, as along a ridge that bends
     trail: list[Array] = []  # where the last steps led
     for _ in range(steps):
@@ -771,6 +773,10 @@ def maximise(
             if not width or (away > np.sqrt(moving.size) and slow < 2):  # farther than chance would have it
                 break
             left, slow, damping = left[1:], 0, 1e-3
+        if not width and best.log_likelihood > point.log_likelihood + away**2 / 2 + NEEDED:  # weights led astray
+            progress(f"log likelihood {point.log_likelihood:.1f}, where {best.log_likelihood:.1f} was passed")
+            point = best
+            continue
         within = f" by readings that hold within {100 * width:g} %" if width else ""
         progress(f"log likelihood {point.log_likelihood:.1f}, {away:.2g} standard errors from the maximum{within}")
         if not width and (away < close or slow == 2):
@@ -801,7 +807,8 @@ def maximise(
                     point = _farther(likelihood, trial, trail)
                     gain += point.log_likelihood - trial.log_likelihood
                 trail = [*trail[-1:], point.x]
-                slow = slow + 1 if gain < (1.0 if width else close**2 / 8) else 0
+                best = max(best, point, key=lambda p: p.log_likelihood)
+                slow = slow + 1 if gain < (max(1.0, CREEP * away**2 / 2) if width else close**2 / 8) else 0
                 break
             sure = False  # what may fail is tried without derivatives: a quarter of the work
             if bent or width:
@@ -811,7 +818,7 @@ def maximise(
             if not width:
                 break
             slow, damping = 2, 1e-3
-    away = np.inf if left[0] else away
+    away, point = (np.inf, best) if left[0] else (away, point)
     at_bound = ((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0))
     covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound)[0]
     covariance[np.ix_(inner, inner)] = inverse(point.information[np.ix_(inner, inner)])
