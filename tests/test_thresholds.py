@@ -14,12 +14,14 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import minimize
 from threshold_tables import generated, with_noise
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.settings import Parameter
 from srfcli.data.thresholds import read_thresholds, thresholds, thresholds_csv
 from srfcli.inference.free_parameters import FreeParameter, Scale, free_parameters, with_transmission
+from srfcli.inference.profile import interval_end
 from srfcli.inference.thresholds import FAR_CROSSING, Matcher, fit_thresholds, forced_slopes, hopf_slopes, uncertainty
 from srfcli.numerics.boundary import along, polish
 from srfcli.numerics.critical import critical_line
@@ -396,6 +398,7 @@ def fit_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     @click.option("--bounds", multiple=True)
     @click.option("--method", "methods", multiple=True)
     @click.option("--max-evaluations", type=int)
+    @click.option("--profile", is_flag=True)
     @output_options
     def command(path: Path, **options: Any) -> None:
         run(path, **options)
@@ -462,6 +465,60 @@ def test_exit_codes_of_unfinished_fits(fit_command: Any, small: Any, monkeypatch
     monkeypatch.setattr(Progress, "advance", interrupt)
     done = fit_command(*arguments)
     assert done.exit_code == 130 and "powell,lambda" in done.stdout and "least-squares" not in done.stdout
+
+
+# intervals
+
+
+@pytest.mark.parametrize("error", [0.02, 0.3, 2.0])
+def test_an_interval_ends_where_its_closed_form_does(error: float) -> None:
+    """A measured exp(d): the deviance ((exp(d) - 1)/error)^2 is 3.84 at ln(1 + 1.96 error) and -ln(1 - 1.96 error)."""
+    half = 1.959964 * error
+    up = interval_end(lambda d: (np.expm1(d) / error) ** 2, error, 5.0)
+    assert up == pytest.approx(np.log1p(half), rel=0.02)
+    down = interval_end(lambda d: (np.expm1(-d) / error) ** 2, error, 5.0)
+    assert down is None if half >= 1 else down == pytest.approx(-np.log1p(-half), rel=0.02)
+    assert interval_end(lambda d: (np.expm1(d) / error) ** 2, error, 0.9 * np.log1p(half)) is None  # a bound comes first
+
+
+def test_a_ridge_has_intervals_beyond_its_errors(fit_command: Any, model: Any) -> None:
+    """A, B and D0 of five loads without modulation: ends hold by Nelder and Mead's method on the roots of the polynomial."""
+    V = np.array([1.0, 5.0, 10.0, 50.0, 100.0])
+    table = with_noise(generated(model, V, np.zeros(5), values=model.defaults()), 2)
+    Path("loads.csv").write_text(thresholds_csv(table), encoding="utf-8")
+    words = ("loads.csv", "--free", "A,B,D0", "--method", "least-squares")
+    plain = json.loads(fit_command(*words, "--json").stdout)
+    assert any("not quadratic within" in n and "of A, B, D0" in n and "--profile" in n for n in plain["notes"])
+    done = fit_command(*words, "--profile", "--out", "fit.json")
+    assert done.exit_code == 0, done.output
+    data = json.loads(Path("fit.json").read_text(encoding="utf-8"))
+    row = {r["parameter"]: r for r in data["rows"]}["D0"]
+    assert row["high"] - row["value"] > 1.5 * 1.96 * row["stderr"] > 1.5 * (row["value"] - row["low"])
+    assert any(
+        "standard errors are too small" in n and "D0 2.1 times as far up" in n and "low and high" in n for n in data["notes"]
+    )
+
+    def chi2(part: Any, D0: float) -> float:
+        found = [hopf_points(model, model.vector({"A": part[0], "B": part[1], "D0": D0, "V": v})) for v in V]
+        loads = [q[0].W0 if q else 1e3 for q in found]
+        return float((((loads - table.W0c) / table.sigma) ** 2).sum())
+
+    best = np.array([r["value"] for r in data["rows"]])
+    for end in (row["low"], row["high"]):
+        start = best[:2] * (end / best[2]) ** np.array([0.5, 0.75])  # along the ridge
+        refit = minimize(chi2, start, args=(end,), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-4, "maxiter": 2000})
+        assert refit.fun - data["meta"]["methods"][0]["chi2"] == pytest.approx(3.84, abs=0.1)
+
+
+@pytest.mark.parametrize("more", [(), ("--profile",)])
+def test_intervals_are_errors_where_the_likelihood_is_quadratic(fit_command: Any, model: Any, more: tuple[str, ...]) -> None:
+    table = generated(model, np.array([1.0, 10.0, 50.0, 100.0]), np.zeros(4), values=model.defaults(), relative=0.003)
+    Path("loads.csv").write_text(thresholds_csv(table), encoding="utf-8")
+    done = fit_command("loads.csv", "--free", "A,B", "--set", "A=0.0125", "--method", "least-squares", *more, "--json")
+    data = json.loads(done.stdout)
+    for row in data["rows"]:
+        assert row["high"] - row["low"] == pytest.approx(2 * 1.96 * row["stderr"], rel=0.03)
+    assert not any("quadratic" in n for n in data["notes"])
 
 
 def test_a_threshold_far_above_that_without_modulation_is_found(model: Any) -> None:

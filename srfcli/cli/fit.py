@@ -108,11 +108,11 @@ def command(
             raise SrfError(
                 f"{source}: a recording, and no experiment yet", f"`srf new {source}` writes the experiment.toml to fit."
             )
-        meant = ("starts", "profile", "trend", "vary", "by", "prior", "track", "sample", "draws", "reader")
+        meant = ("starts", "trend", "vary", "by", "prior", "track", "sample", "draws", "reader")
         _refuse(meant, "recordings")
         fit_thresholds(
             source, system=system, output=output, free=options["free"], bounds=options["bounds"],
-            methods=options["method"], tol=options["tol"], max_evaluations=options["max_evaluations"],
+            methods=options["method"], tol=options["tol"], max_evaluations=options["max_evaluations"], profile=options["profile"],
         )  # fmt: skip
         return
     _refuse(("bounds", "method", "tol", "max_evaluations"), "critical loads")
@@ -261,11 +261,13 @@ def fit_thresholds(
     methods: Sequence[str] = (),
     tol: float | None = None,
     max_evaluations: int | None = None,
+    profile: bool = False,
 ) -> None:
     """Fit the parameters `free` (names, also with commas) to the table at `path`, write the result, end the command.
 
-    `bounds` are NAME=LOW:HIGH, `methods` both unless named, `tol` the relative accuracy of each critical load. Starts are
-    the system's values. Exit codes: 3 where the limit of evaluations cut a method, 130 where it was interrupted.
+    `bounds` are NAME=LOW:HIGH, `methods` both unless named, `tol` the relative accuracy of each critical load; `profile` refits
+    for intervals. Starts are the system's values. Exit codes: 3 where the limit of evaluations cut a method, 130 where it was
+    interrupted.
     """
     from srfcli.data.thresholds import read_thresholds
     from srfcli.inference import thresholds as inference
@@ -290,7 +292,7 @@ def fit_thresholds(
 
         fit = inference.fit_thresholds(
             model, table, scale=scale, values=resolved.values, methods=methods or inference.METHODS, report=report,
-            tol=system.tolerance(tol).value, max_evaluations=max_evaluations or inference.MAX_EVALUATIONS,
+            tol=system.tolerance(tol).value, profile=profile, max_evaluations=max_evaluations or inference.MAX_EVALUATIONS,
         )  # fmt: skip
     found = ThresholdFitResult(fit, model.title, {k: v for k, v in resolved.described().items() if k not in GIVEN})
     emit(

@@ -13,22 +13,10 @@ from numpy.typing import NDArray
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError
 from srfcli.inference.fit import root
-from srfcli.inference.state_space import CLOSER, StateSpaceFit, maximise
+from srfcli.inference.profile import CHI2_95, Interval, interval_end, quadratic
+from srfcli.inference.state_space import CLOSER, StateSpaceFit, along, maximise
 
-# Profile likelihood: each parameter held at a value, the others refitted; the interval ends where the fit is worse by 3.84.
-
-CHI2_95 = 3.841458820694124  # of chi-squared with one degree of freedom, 95 %
-OPEN_INTERVAL = 8.0  # standard errors: an interval that has not ended there is open
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A 95 % interval of one parameter, in um, s, N; None where the likelihood does not end it before a bound."""
-
-    name: str
-    low: float | None
-    high: float | None
-    evaluations: int
+# Profile likelihood: each parameter held at a value, the others refitted.
 
 
 def profile(found: StateSpaceFit, name: str, *, progress: Callable[[str], None] = lambda text: None) -> Interval:
@@ -41,33 +29,41 @@ def profile(found: StateSpaceFit, name: str, *, progress: Callable[[str], None] 
 
 
 def _end(found: StateSpaceFit, name: str, side: float) -> float | None:
-    """Return where the profile crosses CHI2_95 on one side, by secant on its root, which is nearly linear in the coordinate."""
+    """Return where the profile crosses CHI2_95 on one side."""
     likelihood, best, covariance = found.likelihood, found.maximum.point.x, found.maximum.covariance
     k = likelihood.names.index(name)
     error = float(np.sqrt(covariance[k, k]))
-    if not error > 0:
-        return None
-    along = covariance[:, k] / covariance[k, k]
-    limit = likelihood.upper[k] if side > 0 else likelihood.lower[k]
+    room = likelihood.upper[k] - best[k] if side > 0 else best[k] - likelihood.lower[k]
     x = best
-    points = [(0.0, -np.sqrt(CHI2_95))]
-    step = np.sqrt(CHI2_95) * error
-    for _ in range(8):
-        value = best[k] + side * step
-        if (value - limit) * side > 0 or step > OPEN_INTERVAL * error * np.sqrt(CHI2_95):
-            return None
-        start = np.clip(x + along * (value - x[k]), likelihood.lower, likelihood.upper)
+
+    def deviance(distance: float) -> float:
+        nonlocal x
+        value = best[k] + side * distance
+        start = np.clip(x + covariance[:, k] / covariance[k, k] * (value - x[k]), likelihood.lower, likelihood.upper)
         start[k] = value
         point = maximise(likelihood, start, held=(name,), close=CLOSER).point
-        x, cost = point.x, 2 * (found.log_likelihood - point.log_likelihood)
-        points.append((step, np.sign(cost) * np.sqrt(abs(cost)) - np.sqrt(CHI2_95)))
-        if abs(points[-1][1]) < 0.01:
-            break
-        (a, fa), (b, fb) = points[-2:]
-        step = max(b - fb * (b - a) / (fb - fa), 0.2 * b) if fb != fa else 1.5 * b
-    else:
-        value = best[k] + side * step
+        x = point.x if np.isfinite(point.log_likelihood) else x
+        return 2 * (found.log_likelihood - point.log_likelihood)
+
+    distance = interval_end(deviance, error, float(room))
+    if distance is None:
+        return None
+    value = best[k] + side * distance
     return float(np.exp(value) if likelihood.logarithmic[k] else value)
+
+
+def not_quadratic(found: StateSpaceFit) -> list[str]:
+    """Return the parameters at whose ends of 1.96 standard errors the likelihood is not what the covariance promises.
+
+    The others follow by the covariance and are not refitted: a ridge that bends is found, too.
+    """
+    likelihood, maximum, names = found.likelihood, found.maximum, []
+    for j in np.flatnonzero(np.diag(maximum.covariance)[: len(likelihood.problem.names)] > 0).tolist():
+        reach = np.sqrt(CHI2_95 * maximum.covariance[j, j])
+        ends = [2 * (found.log_likelihood - along(likelihood, maximum, j, side * reach).log_likelihood) for side in (-1, 1)]
+        if not quadratic(ends):
+            names.append(likelihood.names[j])
+    return names
 
 
 # Draws from the posterior by Markov chains, under flat priors within the bounds, and what they are worth.

@@ -1359,7 +1359,7 @@ def _ridges(likelihood: Likelihood, maximum: Maximum) -> list[int]:
     for j in np.nonzero(variances[: len(likelihood.problem.names)] > 0)[0].tolist():
         d = PROBE * np.sqrt(variances[j])
         if d < RIDGE_REACH * _size(likelihood, point, j):
-            lost = [point.log_likelihood - _along(likelihood, maximum, j, side * d).log_likelihood for side in (1, -1)]
+            lost = [point.log_likelihood - along(likelihood, maximum, j, side * d).log_likelihood for side in (1, -1)]
             if min(lost) < LOST_CURVATURE * PROBE**2 / 2:
                 found.append(j)
     return found
@@ -1369,7 +1369,7 @@ def _size(likelihood: Likelihood, point: Point, j: int) -> float:
     return 1.0 if likelihood.logarithmic[j] else abs(float(point.x[j]))
 
 
-def _along(likelihood: Likelihood, maximum: Maximum, j: int, d: float) -> Point:
+def along(likelihood: Likelihood, maximum: Maximum, j: int, d: float) -> Point:
     """Return the point at which parameter j is moved by d, and the others as the covariance has it."""
     column = maximum.covariance[:, j] / maximum.covariance[j, j]
     x = np.clip(maximum.point.x + d * column, likelihood.lower, likelihood.upper)
@@ -1454,7 +1454,7 @@ def _beside(likelihood: Likelihood, maximum: Maximum, j: int) -> tuple[Point, Ar
     count = int(np.clip(RIDGE_STRIDE * _size(likelihood, maximum.point, j) / (2 * s), *NEIGHBOUR_STEPS))
     for side in (1, -1):
         for k in range(1, count + 1):
-            points.append(_along(likelihood, maximum, j, side * 2 * k * s))
+            points.append(along(likelihood, maximum, j, side * 2 * k * s))
             places.append(side * 2 * k * s)
     found, at = np.array([p.log_likelihood for p in points]), np.array(places)
     share = np.exp(found - found.max())

@@ -7,8 +7,10 @@ squares (trust region, Branch, Coleman and Li 1999) with the exact derivatives o
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,6 +19,7 @@ from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.thresholds import Thresholds
 from srfcli.inference.free_parameters import RHO, Scale
+from srfcli.inference.profile import CHI2_95, Interval, interval_end, quadratic
 from srfcli.numerics.boundary import CHUNK, BoundaryPoint, along, linearise_boundary, polish
 from srfcli.numerics.collocation import by_mesh, join
 from srfcli.numerics.critical import critical_line
@@ -375,12 +378,18 @@ class MethodFit:
 
 @dataclass(frozen=True)
 class ThresholdFit:
-    """A table fitted by one or both methods; `status` is the worst of theirs."""
+    """A table fitted by one or both methods; `status` is the worst of theirs.
+
+    `intervals` are by the profile likelihood from the lowest chi2, where they were asked for; without them `bent` are the
+    parameters whose standard errors promise another chi2 than there is at their ends.
+    """
 
     table: Thresholds
     scale: Scale
     methods: tuple[MethodFit, ...]
     status: Status
+    intervals: tuple[Interval, ...] = ()
+    bent: tuple[str, ...] = ()
 
     @property
     def best(self) -> MethodFit:
@@ -454,12 +463,14 @@ def fit_thresholds(
     methods: Sequence[str] = METHODS,
     tol: float = 1e-6,
     max_evaluations: int = MAX_EVALUATIONS,
+    profile: bool = False,
     report: Report | None = None,
 ) -> ThresholdFit:
     """Return the parameters of `scale` that bring the model's critical loads nearest to the table's.
 
     `values` are all parameters in base units, `tol` the relative accuracy of each critical load; `report` is called after
-    each evaluation. An interruption (KeyboardInterrupt) ends the fit with the best found so far, its status says so.
+    each evaluation. `profile` adds intervals by the profile likelihood. An interruption (KeyboardInterrupt) ends the fit with the
+    best found so far, its status says so.
     """
     for name in methods:
         if name not in METHODS:
@@ -476,7 +487,60 @@ def fit_thresholds(
         if fits[-1].status is Status.INTERRUPTED:
             break
     worst = next((m.status for m in fits if not m.status.ok), Status.OK)
-    return ThresholdFit(table, scale, tuple(fits), worst)
+    done = ThresholdFit(table, scale, tuple(fits), worst)
+    if worst is Status.INTERRUPTED or not done.best.status.ok:
+        return done
+    work = _Work(Matcher(model, table, values=values, scale=scale, tol=tol), "profile", sys.maxsize, report)
+    try:
+        return replace(done, intervals=_profiles(work, done.best)) if profile else replace(done, bent=_bent(work, done.best))
+    except KeyboardInterrupt:
+        return replace(done, status=Status.INTERRUPTED)
+
+
+def _ridge(scale: Scale, best: MethodFit, k: int) -> tuple[float, Array]:
+    """Return the standard error of coordinate k, infinite or NaN where there is none, and how all (k,) move with it."""
+    errors = best.uncertainty.errors / scale.rates(best.match.y)
+    moves = np.nan_to_num(best.uncertainty.correlation[k] * errors / errors[k], posinf=0.0, neginf=0.0)
+    return float(errors[k]), moves
+
+
+def _bent(work: _Work, best: MethodFit) -> tuple[str, ...]:
+    """Return the parameters at whose ends of 1.96 standard errors, the others by correlation, chi2 is not that promised."""
+    scale, found = work.matcher.scale, []
+    for k, name in enumerate(scale.names):
+        error, along = _ridge(scale, best, k)
+        if np.isfinite(error):
+            reach = np.sqrt(CHI2_95) * error * along
+            ends = [work.matcher.match(np.clip(best.match.y + side * reach, *scale.bounds)).cost - best.cost for side in (-1, 1)]
+            found += [] if quadratic(ends) else [name]
+    return tuple(found)
+
+
+def _profiles(work: _Work, best: MethodFit) -> tuple[Interval, ...]:
+    """Return the interval of each parameter by the profile likelihood: each held on either side, the others fitted again."""
+    scale, top, found = work.matcher.scale, best.match.y, []
+    everything = np.ones(len(work.matcher.table), dtype=bool)
+    for k, q in enumerate(scale):
+        error, along = _ridge(scale, best, k)
+        others, ends, before = np.arange(len(scale)) != k, [], len(work.trace)
+        for side, bound in zip((-1.0, 1.0), scale.bounds, strict=True):
+            last = top
+
+            def deviance(distance: float, k: int = k, side: float = side, along: Array = along, others: Array = others) -> float:
+                nonlocal last
+                start = last + along * (top[k] + side * distance - last[k])
+                start[k] = top[k] + side * distance
+                work.best = None
+                with suppress(_Stop):  # where nothing is left to minimise
+                    _trust_region(work, start, everything, others)
+                assert work.best is not None
+                last = work.best.y
+                return work.best.cost - best.cost
+
+            distance = interval_end(deviance, error, float(abs(bound[k] - top[k])))
+            ends.append(None if distance is None else q.value(float(top[k] + side * distance)))
+        found.append(Interval(q.name, ends[0], ends[1], len(work.trace) - before))
+    return tuple(found)
 
 
 def _run(matcher: Matcher, method: str, limit: int, report: Report | None) -> MethodFit:
@@ -577,24 +641,34 @@ def _least_squares(work: _Work, y: Array) -> Status:
     return status
 
 
-def _trust_region(work: _Work, y: Array, kept: Array) -> tuple[Status, Array]:
-    """Minimise the squares of the residuals `kept` (n,) from coordinates `y`, and return where that ended."""
+def _trust_region(work: _Work, y: Array, kept: Array, free: Array | None = None) -> tuple[Status, Array]:
+    """Minimise the squares of the residuals `kept` (n,) from coordinates `y`, those `free` (k,); return where that ended."""
     from scipy.optimize import least_squares
 
     low, high = work.matcher.scale.bounds
+    free = np.ones(y.size, dtype=bool) if free is None else free
     inner = np.clip(y, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
+
+    def whole(part: Array) -> Array:
+        found = inner.copy()
+        found[free] = part
+        return found
+
+    if not free.any():
+        work.at(inner)
+        return Status.OK, inner
     done = least_squares(
-        lambda c: work.at(c).residuals[kept],
-        inner,
-        jac=lambda c: work.jacobian(c)[kept],
-        bounds=(low, high),
+        lambda c: work.at(whole(c)).residuals[kept],
+        inner[free],
+        jac=lambda c: work.jacobian(whole(c))[kept][:, free],
+        bounds=(low[free], high[free]),
         method="trf",
         ftol=LEAST_CHANGES[0] * work.matcher.tol,
         xtol=LEAST_CHANGES[1] * work.matcher.tol,
         gtol=1e-10,
         max_nfev=work.limit,
     )
-    return Status.OK if done.status > 0 else Status.EVALUATIONS, done.x
+    return Status.OK if done.status > 0 else Status.EVALUATIONS, whole(done.x)
 
 
 def _powell(work: _Work, y: Array) -> Status:

@@ -16,6 +16,8 @@ from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import lag_one
+from srfcli.inference.posterior import not_quadratic
+from srfcli.inference.profile import FARTHER
 from srfcli.inference.state_space import typical_friction
 from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
@@ -30,7 +32,8 @@ if TYPE_CHECKING:
     from srfcli.data.thresholds import Thresholds
     from srfcli.data.values import Experiment
     from srfcli.inference.fit import Fit, RunFit
-    from srfcli.inference.posterior import Interval, Posterior
+    from srfcli.inference.posterior import Posterior
+    from srfcli.inference.profile import Interval
     from srfcli.inference.recordings import RecordingFit
 PARAMETERS = (
     Column("parameter", "", "name"),
@@ -99,6 +102,7 @@ ADVICE = {
     "parameter that is tied to another (--free).",
     Status.INTERRUPTED: "the likeliest parameters so far are above.",
 }
+LINEAR = "intervals: 1.96 standard errors; --profile refits, 95 %"
 CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
 TESTS_TOLD = 3  # tests that a fit fails, of which its notes tell, the worst first
 
@@ -317,7 +321,8 @@ class FitResult(Result):
             notes.append(f"A - B = {difference:.6g} +- {error:.2g}, the covariance of the two allowed for")
         done = [i.name for i in self.intervals]
         whose = "profile likelihood" + (f" of {', '.join(done)}, else 1.96 standard errors" if len(done) < len(fit.names) else "")
-        notes.append("intervals: " + (whose if self.intervals else "1.96 standard errors; --profile refits") + ", 95 %")
+        notes.append(f"intervals: {whose}, 95 %" if self.intervals else LINEAR)
+        notes += self._beyond_errors()
         if len(found.starts) > 1:
             notes.append(f"{sum(same for _, same in found.starts)} of {len(found.starts)} starts ended in this minimum")
         notes += self._colours()
@@ -347,6 +352,18 @@ class FitResult(Result):
         if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
             notes.append(f"interrupted: {len(found.starts)} of {self.asked} starts were done")
         return notes
+
+    def _beyond_errors(self) -> list[str]:
+        """Return which standard errors are too small by the intervals; without any, whether those of critical loads may be."""
+        found, fit = self.found, self.found.fit
+        if self.intervals:
+            place = [fit.names.index(i.name) for i in self.intervals]
+            bounds = [(float(fit.lower[k]), float(fit.upper[k])) for k in place]
+            names = [i.name for i in self.intervals]
+            return farther(self.intervals, [fit.values[n] for n in names], [fit.stderr[n] for n in names], bounds)
+        if not (found.problem.tables and found.state_space and found.status.ok):
+            return []
+        return bent(not_quadratic(found.state_space))
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return each run's recording and prediction above its residual, and each table's measured and computed loads."""
@@ -404,6 +421,29 @@ def load_rows(table: Thresholds, match: Match) -> list[tuple[Any, ...]]:
     kinds = ["missing" if c is None else getattr(c.point, "kind", "hopf") for c in match.crossings]
     cells = (table.lines, table.V, table.eps, table.W0c, table.sigma, match.loads, match.residuals, match.rivals, kinds)
     return [tuple(v.item() if hasattr(v, "item") else v for v in row) for row in zip(*cells, strict=True)]
+
+
+def bent(names: Sequence[str]) -> list[str]:
+    """Return a sentence on parameters whose standard errors do not say how the likelihood falls off, if there are any."""
+    told = f"the likelihood is not quadratic within 1.96 standard errors of {', '.join(names)}"
+    return [f"{told}, which may be far too small: --profile gives intervals that hold"] if names else []
+
+
+def farther(
+    intervals: Sequence[Interval], values: Sequence[float], errors: Sequence[float], bounds: Sequence[tuple[float, float]]
+) -> list[str]:
+    """Return a sentence where intervals reach FARTHER than standard errors say; all of the parameters in the intervals' order."""
+    told = []
+    for interval, value, error, (lower, upper) in zip(intervals, values, errors, bounds, strict=True):
+        for way, end, bound in (("down", interval.low, lower), ("up", interval.high, upper)):
+            if not (np.isfinite(error) and error > 0):
+                continue
+            if end is None and abs(bound - value) > 1.96 * error:
+                told.append(f"{interval.name} without end {way}")
+            elif end is not None and abs(end - value) > FARTHER * 1.96 * error:
+                told.append(f"{interval.name} {abs(end - value) / (1.96 * error):.1f} times as far {way}")
+    said = "the likelihood is not quadratic, and standard errors are too small. 95 % intervals reach, over 1.96 standard errors, "
+    return [f"{said}{', '.join(told)}: take low and high. Fewer free parameters or other data narrow them"] if told else []
 
 
 def load_notes(fit: Fit) -> list[str]:
@@ -467,6 +507,8 @@ ESTIMATES = (
     Column("parameter", "", "name"),
     Column("value", "", "estimate, in the unit beside it", ".7g"),
     Column("stderr", "", "standard error from the given sigma, linearised", ".3g"),
+    Column("low", "", "lower end of the 95 % interval"),
+    Column("high", "", "upper end of the 95 % interval"),
     Column("lower", "", "bound of the search"),
     Column("upper", "", "bound of the search"),
     Column("unit", "", "unit of all the columns before"),
@@ -514,10 +556,13 @@ class ThresholdFitResult(Result):
     def table(self) -> Table:
         """Return the estimates of each method; `meta` has the methods, the traces, the loads and the information matrices."""
         fit, rows = self.found, []
+        profiled = {i.name: (i.low, i.high) for i in fit.intervals}
         for m in fit.methods:
             for i, q in enumerate(fit.scale):
-                numbers = (m.values[i], m.uncertainty.errors[i], q.lower, q.upper)
-                shown = [q.declared(float(x)) for x in numbers]
+                value, error = m.values[i], m.uncertainty.errors[i]
+                ends = profiled.get(q.name, (value - 1.96 * error, value + 1.96 * error))
+                numbers = (value, error, *ends, q.lower, q.upper)
+                shown = [None if x is None else q.declared(float(x)) for x in numbers]
                 start, said = q.declared(float(q.start)), m.uncertainty.flags[i] or "ok"
                 rows.append((m.method, q.name, *shown, q.parameter.unit, start, said))
         meta: dict[str, Any] = {
@@ -539,7 +584,7 @@ class ThresholdFitResult(Result):
 
     def _remarks(self) -> list[str]:
         """Return notes: the least determined combination, whether the model describes the data, how data were matched."""
-        notes = []
+        notes = ["intervals: profile likelihood, 95 %" if self.found.intervals else LINEAR]
         for m in self.found.methods:
             if m.uncertainty.weakest:
                 notes.append(f"{m.method}: least determined is {m.uncertainty.weakest}")
@@ -550,7 +595,15 @@ class ThresholdFitResult(Result):
                     " not describe the data within sigma, and the errors do not allow for that"
                 )
             notes += [f"{m.method}: {note}" for note in m.notes]
-        return notes
+        return notes + self._beyond_errors()
+
+    def _beyond_errors(self) -> list[str]:
+        """Return which standard errors are too small by the intervals; without any, whether they may be."""
+        fit, best = self.found, self.found.best
+        if not fit.intervals:
+            return bent(fit.bent)
+        bounds = [(q.lower, q.upper) for q in fit.scale]
+        return farther(fit.intervals, best.values.tolist(), best.uncertainty.errors.tolist(), bounds)
 
     @cached_property
     def methods(self) -> Table:

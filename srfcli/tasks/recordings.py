@@ -18,7 +18,8 @@ from srfcli.results.check import CheckResult
 from srfcli.results.fit import FitResult
 
 if TYPE_CHECKING:
-    from srfcli.inference.posterior import Interval, Posterior
+    from srfcli.inference.posterior import Posterior
+    from srfcli.inference.profile import Interval
 
 
 def read_experiment(
