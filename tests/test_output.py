@@ -77,6 +77,13 @@ def test_a_terminal_gets_rich_only_where_it_fits(monkeypatch: pytest.MonkeyPatch
     assert "a, [b]" in stream.getvalue() and "no-convergence" in stream.getvalue() and "…" not in stream.getvalue()
 
 
+def test_a_number_that_ran_away_is_short_in_text_and_whole_in_files() -> None:
+    value = 1.23456789012345678e37
+    table = Table("x/1", (Column("rms", "", "r", ".4f"), Column("effective", "", "e", ".0f")), [(value, -value), (0.9987, 412.0)])
+    assert to_text(table, full=False).split() == ["rms", "effective", "1.23457e+37", "-1.23457e+37", "0.9987", "412"]
+    assert repr(value) in to_csv(table) and repr(value) in to_json(table)
+
+
 def test_a_row_of_the_wrong_length_is_refused() -> None:
     with pytest.raises(ValueError, match="a row of 1 cells under 4 columns"):
         Table("s", COLUMNS, [(1,)])

@@ -270,7 +270,8 @@ def test_every_shipped_effect_has_a_remedy() -> None:
 @pytest.mark.parametrize(
     ("value", "error", "text"),
     [(0.006534, 5e-5, "0.00653(5)"), (0.5549, 5e-4, "0.5549(5)"), (19.04, 1.23, "19.0(12)"), (-0.012, 4e-4, "−0.0120(4)"),
-     (280.0, 33.0, "280(30)"), (1.23e-5, 2e-7, "1.230(20)·10⁻⁵"), (3.0, 0.0, "3.000"), (None, 1.0, "–")],
+     (280.0, 33.0, "280(30)"), (1.23e-5, 2e-7, "1.230(20)·10⁻⁵"), (3.0, 0.0, "3.000"), (None, 1.0, "–"),
+     (1.23456789e37, 2e10, "1.23457·10³⁷"), (0.0126, 1e-38, "0.0126000")],
 )  # fmt: skip
 def test_errors_in_brackets(value: float | None, error: float, text: str) -> None:
     assert report_text.bracketed(value, error) == text

@@ -23,7 +23,7 @@ from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
 from srfcli.results.figures import draw_loads, stacked
 from srfcli.results.report_text import bracketed, unit_text, with_unit
-from srfcli.results.tables import STATUS, Column, Result, Table, own_figure
+from srfcli.results.tables import STATUS, Column, Result, Table, cell_text, own_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -313,9 +313,9 @@ class FitResult(Result):
         """Return what is to be known beside the numbers, in sentences."""
         found, fit = self.found, self.found.fit
         of = "runs" if fit.runs else "critical loads"
-        notes = [f"rms over noise {fit.rms_over_noise():.3f} in the {of} fitted"]
+        notes = [f"rms over noise {cell_text(fit.rms_over_noise(), '.3f')} in the {of} fitted"]
         if any(f.holdout for f in fit.runs) or any(t.loads.holdout for t in fit.tables):
-            notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
+            notes[0] += f", {cell_text(fit.rms_over_noise(holdout=True), '.3f')} in those held out"
         if self.difference is not None and self.difference[1]:
             difference, error = self.difference
             notes.append(f"A - B = {difference:.6g} +- {error:.2g}, the covariance of the two allowed for")

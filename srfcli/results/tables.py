@@ -93,6 +93,9 @@ def plain_value(value: Any) -> Any:
     return str(value)
 
 
+FIXED = 1e6  # from here on a fixed number of decimals is more digits than a column of six significant ones has
+
+
 def cell_text(value: Any, format: str | None = None) -> str:
     """Return one cell as text: with twelve digits, or in `format`; "-" for nothing, "inf" for an infinity."""
     if isinstance(value, float) and math.isinf(value):
@@ -106,7 +109,7 @@ def cell_text(value: Any, format: str | None = None) -> str:
         return repr(float(f"{simple:.12g}"))
     if isinstance(simple, float):
         try:
-            return f"{simple:{format}}"
+            return f"{simple:{Column.format if abs(simple) >= FIXED and str(format).endswith('f') else format}}"
         except ValueError:  # a format for something else than a number
             return repr(simple)
     return printable(" ".join(str(simple).split()))
