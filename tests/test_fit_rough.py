@@ -16,6 +16,7 @@ from srfcli.codegen.c_source import compiler
 from srfcli.data.groups import grouped, labels
 from srfcli.diagnosis.goodness_of_fit import uneven_noise
 from srfcli.inference.fit import between_groups
+from srfcli.inference.recordings import FittedField
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, Track, move
@@ -29,6 +30,25 @@ pytestmark = [
     pytest.mark.usefixtures("empty_folder"),
     pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here"),
 ]
+
+
+def test_mass_and_compliance_are_found_from_twice_their_values(tmp_path):
+    """An oscillation that a modulation begins, at the noise of a good gauge; the truth is that of the simulation."""
+    drive, gauge = ["--drive", "0.6:10", "--W0", "7", "--eps", "0.1", "--onset", "0.1"], ["--rate", "1000", "--noise", "0.002"]
+    words = [*drive, *gauge, "--K", "0.21", "--seed", "6", "--free", "mu0,A,B,D0,lambda,M", "--out-dir", str(tmp_path / "made")]
+    assert CliRunner().invoke(cli, ["simulate", *words]).exit_code == 0
+    experiment = srf.read_experiment(tmp_path / "made")
+    truth = {q.name: q.value for q in experiment.parameters}
+    off = {"M": 1.8, "lambda": 2.0}
+    found = srf.fit(
+        replace(experiment, parameters=tuple(replace(q, value=q.value * off.get(q.name, 1.0)) for q in experiment.parameters))
+    )
+    assert found.status.ok
+    for name in ("M", "lambda", "A", "B", "D0"):
+        assert abs(found.values[name] - truth[name]) < 4 * found.stderr[name] < 0.04 * truth[name], name
+    for amplitude, told in ((0.02, True), (0.005, False)):  # of a friction of a third
+        own = replace(found, found=replace(found.found, friction_field=FittedField(amplitude, 1.0)))
+        assert any("--starts 5" in note for note in own.table.notes) is told
 
 
 @pytest.fixture(scope="module", params=[(3, 3, 3), (3, 4, 5)], ids=["one track", "own tracks"])

@@ -93,9 +93,10 @@ class Fit:
 
     @property
     def correlation(self) -> Array:
-        """Return the correlation matrix of the estimates."""
+        """Return the correlation matrix of the estimates; NaN with one at a bound."""
         sd = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance / np.outer(sd, sd))
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.covariance / np.outer(sd, sd))
 
     def rms_over_noise(self, *, holdout: bool = False) -> float:
         """Return the residuals' root mean square over the white noise level, all runs fitted (or held out) together.

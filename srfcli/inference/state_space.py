@@ -1241,6 +1241,7 @@ def _fitted(
     if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
         found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
     if fresh and found.status is not Status.INTEGRATION:
+        found = _under_less(wide, found, start, progress)
         found = scan_narrow(wide, found.point, progress) or found
     best = StateSpaceFit(wide, found)
     if found.status is Status.INTEGRATION:
@@ -1778,6 +1779,20 @@ def wide_starts(rough: Likelihood, start: Mapping[str, float], progress: Callabl
         if np.isfinite(trial.log_likelihood):
             trials.append(trial)
     return [trial.x for trial in sorted(trials, key=lambda p: -p.log_likelihood)]
+
+
+def _under_less(rough: Likelihood, found: Maximum, start: Mapping[str, float], progress: Callable[[str], None]) -> Maximum:
+    """Return the maximum from the start under the least of the wide fields where that is likelier than one of another kind.
+
+    That is a maximum under a field so wide that the filter follows the recording whatever the parameters are: these then drift to
+    their bounds, and no step leads back.
+    """
+    amplitude = rough.names.index("field_amplitude")
+    if found.point.x[amplitude] < _under_field(rough, found.point.x, WIDE[1], SHORT[0])[amplitude]:
+        return found
+    x = _under_field(rough, rough.coordinates(start), WIDE[0], SHORT[0])
+    other = maximise(rough, x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
+    return other if other.point.log_likelihood > found.point.log_likelihood + NEEDED else found
 
 
 def _elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:

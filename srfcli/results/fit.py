@@ -18,6 +18,7 @@ from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import lag_one
 from srfcli.inference.posterior import not_quadratic
 from srfcli.inference.profile import FARTHER
+from srfcli.inference.state_space import WIDE as WIDE_FIELDS
 from srfcli.inference.state_space import typical_friction
 from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
@@ -252,15 +253,19 @@ class FitResult(Result):
         return Table("srf.fit/2", PARAMETERS, rows, title, tuple(self._notes()), {}, meta, status=self.worst.value)
 
     @cached_property
+    def _field_share(self) -> float:
+        """Return the amplitude of the random friction field over the friction of the recordings; 0 without one."""
+        own = self.found.friction_field
+        return own.amplitude / max(min(map(typical_friction, self.found.problem.runs)), 1e-6) if own is not None else 0.0
+
+    @cached_property
     def against(self) -> list[str]:
         """Return what speaks against the model, in sentences: random friction that no track has, tests that the fit fails."""
         from srfcli.diagnosis.goodness_of_fit import PLAUSIBLE, shortcomings
 
         found, told = self.found, []
-        if found.friction_field is not None:
-            share = found.friction_field.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
-            if share > PLAUSIBLE:
-                told.append(f"the friction field is {100 * share:.1g} % of the friction, more than a track has")
+        if (share := self._field_share) > PLAUSIBLE:
+            told.append(f"the friction field is {float(f'{100 * share:.1g}'):g} % of the friction, more than a track has")
         if found.state_space is not None and found.status.ok:
             failed = [text for text in shortcomings(found.state_space) if not text.startswith("the field's amplitude")]
             told += [f"the fit fails a test: {text}" for text in dict.fromkeys(failed[:TESTS_TOLD])]
@@ -340,6 +345,11 @@ class FitResult(Result):
         if found.friction_field is not None:
             notes.append(str(found.friction_field))
         notes += self.against
+        if self._field_share > WIDE_FIELDS[1]:
+            notes.append(
+                "under so wide a field a recording is followed whatever the parameters are, and the maximum may be a wrong one: "
+                "try --starts 5, or start values nearer to what is known"
+            )
         if self.against:
             notes.append(
                 "the model does not explain the recordings: the values may be wrong by more than their errors. "
@@ -493,7 +503,7 @@ def flag(fit: Fit, k: int) -> str:
         return "not at the maximum: the fit was interrupted"
     if fit.stderr[name] > WIDE * width / 4:
         return "not identifiable: its error is as wide as its bounds"
-    tied = np.abs(fit.correlation[k]).copy()
+    tied = np.nan_to_num(np.abs(fit.correlation[k]))  # NaN with one at a bound
     tied[k] = 0
     other = int(np.argmax(tied)) if tied.size > 1 else k
     return f"tied to {fit.names[other]}: correlation {fit.correlation[k][other]:.3f}" if tied[other] > ALIKE else ""
