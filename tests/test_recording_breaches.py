@@ -66,7 +66,7 @@ def test_every_key_of_the_format_has_a_breach() -> None:
     places = {row[2].rpartition(": ")[2].rpartition(".")[2].split("[")[0] for row in BREACHES}
     keys = {"format", "title", "stiffness", "mass", "law", "ageing", "interface", "inertia", "value", "lower", "upper"}
     keys |= {"fixed", "name", "unit", "scale", "offset", "integrate", "file", "holdout", "window", "drive", "duration"}
-    keys |= {"velocity", "start", "load", "modulation", "frequency", "amplitude", "onset", "initial"}
+    keys |= {"velocity", "start", "load", "modulation", "frequency", "amplitude", "onset", "phase", "rise", "initial"}
     assert keys <= places, keys - places
     strange = [re.split(r"[.\[]", row[2].rpartition(": ")[2]) for row in BREACHES if row[3] == "unknown key"]
     tables = {parts[0] if len(parts) > 1 else "" for parts in strange}

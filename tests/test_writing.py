@@ -111,6 +111,23 @@ def test_a_load_that_changes_is_read_back(tmp_path: Path, load: Any) -> None:
     assert read.modulation == (30.0, 0.09, 1.0)
 
 
+def test_phase_and_rise_of_a_declared_modulation_make_the_load(tmp_path: Path) -> None:
+    """A run without a column of the load; after the rise the load is the cosine, by hand."""
+    declared = 'modulation = { frequency = 30.0, amplitude = 0.09, onset = 1.0, phase = "0.5 rad", rise = 0.1 }'
+    rows = "".join(f"{t:.3f},10,18\n" for t in T)
+    (tmp_path / "run.csv").write_text("time [s],load_point_velocity [um/s],elongation [um]\n" + rows)
+    (tmp_path / "experiment.toml").write_text(
+        'format = "srf-experiment/1"\n[apparatus]\nstiffness = "0.21 N/um"\nmass = "2.37 kg"\n'
+        '[model]\nlaw = "srf-vsat"\nageing = "dieterich"\ninterface = "elastic"\ninertia = true\n'
+        f'[[runs]]\nname = "run"\nfile = "run.csv"\nload = 9.0\n{declared}\n'
+    )
+    found = read_experiment(tmp_path, registry=load_registry())
+    load, late, early = found.runs[0].load, np.linspace(1.1, 2.0, 50), np.linspace(0.0, 1.0, 5)
+    assert load(late)[0] == pytest.approx(9 * (1 + 0.09 * np.cos(2 * np.pi * 30 * late + 0.5)), rel=1e-12)
+    assert load(early)[0] == pytest.approx(9.0)
+    assert again(found, tmp_path / "again").runs[0].modulation == pytest.approx((30.0, 0.09, 1.0, np.degrees(0.5), 0.1))
+
+
 def test_a_ramp_of_the_drive_keeps_the_displacement(tmp_path: Path) -> None:
     drive = Drive((0.0, 1.0, 2.5), (5.0, 5.0, 20.0), (0.0, 10.0, 0.0))
     read = again(experiment(run(drive=drive)), tmp_path / "made").runs[0]

@@ -28,7 +28,8 @@ from srfcli.core.units import (
     split_quantity,
     unit_factor,
 )
-from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES
+from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Declared
+from srfcli.motion.imposed import RISE
 
 FORMAT = "srf-experiment/1"
 FILE_NAME = "experiment.toml"
@@ -100,7 +101,7 @@ class RunDescription:
     drive: tuple[tuple[float, float], ...] | None
     start: float
     load: float | None
-    modulation: tuple[float, float, float] | None
+    modulation: Declared | None
     initial: str
     node: Node = field(repr=False, compare=False)
     backward: bool = False
@@ -370,15 +371,22 @@ def _drive(node: Node) -> tuple[tuple[float, float], ...]:
     return tuple(steps)
 
 
-def _modulation(node: Node) -> tuple[float, float, float]:
+MODULATION = ("frequency", "amplitude", "onset", "phase", "rise")  # the keys, in the order of a run's values
+
+
+def _modulation(node: Node) -> Declared:
+    """Return frequency (Hz), amplitude, onset (s), and, where one of them is given, phase (deg) and rise (s)."""
     node.table("modulation = { frequency = 120.0, amplitude = 0.09, onset = 2.0 }.")
-    node.keys(("frequency", "amplitude", "onset"))
+    node.keys(MODULATION)
     frequency = node.require("frequency", "Give it in Hz: frequency = 120.0.")
     amplitude = node.require("amplitude", "Give it relative to the mean load: amplitude = 0.09.")
     f = frequency.positive("Hz", "a frequency above 0")
     if not 0 <= amplitude.quantity("1") < 1:
         amplitude.expected("a relative amplitude from 0 to below 1", "At 1 the slider lifts off.")
-    return f, amplitude.quantity("1"), node.read("onset", lambda onset: onset.quantity("s"), 0.0)
+    usual = f, amplitude.quantity("1"), node.read("onset", lambda onset: onset.quantity("s"), 0.0)
+    phase = node.read("phase", lambda phase: phase.quantity("deg"), None)
+    rise = node.read("rise", lambda rise: rise.positive("s", "a rise above 0"), None)
+    return usual if phase is None and rise is None else (*usual, phase or 0.0, rise or RISE / f)
 
 
 # A value in a TOML file that knows where it stands: every breach is told with file, line, key, finding and expectation.

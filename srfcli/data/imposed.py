@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,7 +19,7 @@ from srfcli.data.clock import Place, kept_samples
 from srfcli.data.columns import MOST_BYTES, Columns, Finder, open_source
 from srfcli.data.description import RunDescription
 from srfcli.data.noise import quantisation, saturation, spikes, white_level
-from srfcli.data.values import OBSERVABLES
+from srfcli.data.values import OBSERVABLES, Declared
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation, SampledLoad
 
@@ -646,8 +647,7 @@ def load_of(run: RunDescription, columns: Columns, unit: str) -> tuple[Load, lis
         W0 = 1.0 if run.load is None else run.load
         if run.modulation is None:
             return ConstantLoad(W0), []
-        f, eps, onset = run.modulation
-        return Modulation(W0, eps, f, onset), []
+        return declared_load(W0, run.modulation), []
     place, values = columns.place(role), columns.arrays[role]
     load, notices = load_from_column(place, values, unit)
     first = load.rest(float(place.t[0]))
@@ -656,16 +656,22 @@ def load_of(run: RunDescription, columns: Columns, unit: str) -> tuple[Load, lis
             f"the load is {run.load:g} {unit}, but {place.column} begins with {first:g} {unit}", "Take one of the two away."
         )
     if run.modulation is not None:
-        f, eps, onset = run.modulation
-        told = modulation_notices(place, run.modulation, values)
+        f, told = run.modulation[0], modulation_notices(place, run.modulation, values)
         if f * float(np.median(np.diff(place.t))) > 1 / SAMPLES_A_PERIOD:
-            stated = Modulation(first, eps, f, onset)
+            stated = declared_load(first, run.modulation)
             if np.nanstd(values - stated(place.t)[0]) < DIFFERS * np.nanstd(values):
                 return stated, notices
             what = f"fewer than {SAMPLES_A_PERIOD} samples a period of {f:.6g} Hz do not show the load between them"
             told = [Notice("modulation-differs", place.column, f"{what}, and it is not as declared; the column counts")]
         notices += told
     return load, notices
+
+
+def declared_load(W0: float, modulation: Declared) -> Modulation:
+    """Return the load of a declared modulation: frequency (Hz), amplitude, onset (s), and, if given, phase (deg) and rise (s)."""
+    f, eps, onset, *more = modulation
+    phase, rise = more or (0.0, None)
+    return Modulation(W0, eps, f, onset, rise, math.radians(phase or 0.0))
 
 
 def load_from_column(place: Place, W: Array, unit: str = "N") -> tuple[Load, list[Notice]]:
@@ -818,10 +824,10 @@ def _onset(t: Array, x: Array, frequency: float, amplitude: float) -> float:
     return float(times[int(np.argmax(above > 0.5))])
 
 
-def modulation_notices(place: Place, declared: tuple[float, float, float], W: Array) -> list[Notice]:
+def modulation_notices(place: Place, declared: Declared, W: Array) -> list[Notice]:
     """Return a notice where the declared frequency or amplitude is not what the column has."""
     found = find_modulation(place.t, W)
-    f, eps, _ = declared
+    f, eps = declared[:2]
     if found is None:
         what = f"a modulation of {eps:.4g} at {f:.6g} Hz is declared, but the column shows none; the column counts"
         return [] if eps == 0 else [Notice("modulation-differs", place.column, what)]

@@ -27,6 +27,9 @@ def per_elongation(observable: str, K: float, W: Array | float) -> Array | float
     return {"elongation": 1.0, "force": K, "friction": K / W}[observable]
 
 
+Declared = tuple[float, float, float] | tuple[float, float, float, float, float]  # a modulation, without or with phase and rise
+
+
 @dataclass(frozen=True)
 class ModelChoice:
     """The names that `open_model` takes: friction law, ageing law with modifiers, interface, whether mass counts, effects."""
@@ -75,7 +78,8 @@ class Run:
 
     `observed` is finite everywhere; where `used` is False it is a placeholder and a notice says why. `drive` and `load` hold
     on all of [t[0], t[-1]]. `start` is the place on the track in um, `initial` "steady" or "free", `stiffness` K in N/um,
-    `modulation` the declared frequency (Hz), relative amplitude and onset (s), `quantum` the quantisation step, or 0.
+    `modulation` the declared frequency (Hz), relative amplitude, onset (s), and, if given, phase (deg) and rise (s), `quantum`
+    the quantisation step, or 0.
     `others` are what was observed at the same times besides.
     `proposed` is the observable as the corrections that are proposed would make it, None where there are none.
     `backward` where drive and observable count with the opposite sign, `segments` are the times (s) at which it may be cut.
@@ -94,7 +98,7 @@ class Run:
     drive: Drive = field(repr=False)
     load: Load = field(repr=False)
     stiffness: float
-    modulation: tuple[float, float, float] | None
+    modulation: Declared | None
     quantum: float
     notices: tuple[Notice, ...]
     stress: bool = False

@@ -13,7 +13,7 @@ import numpy as np
 from srfcli.core.errors import SrfError
 from srfcli.core.files import SIDECAR, check_folder_place, clear, parse_toml, read_text, toml_lines, unused_name, whole_folder
 from srfcli.core.units import find_unit
-from srfcli.data.description import LARGEST_DESCRIPTION
+from srfcli.data.description import LARGEST_DESCRIPTION, MODULATION
 from srfcli.data.thresholds import thresholds_csv
 from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, Run
 from srfcli.motion.imposed import Drive
@@ -156,7 +156,7 @@ def _run(run: Run, file: str) -> dict[str, object]:
     if run.others:
         table["observables"] = observables(run)
     if run.modulation is not None:
-        table["modulation"] = dict(zip(("frequency", "amplitude", "onset"), map(float, run.modulation), strict=True))
+        table["modulation"] = dict(zip(MODULATION, map(float, run.modulation), strict=False))
     return table
 
 

@@ -31,6 +31,7 @@ Number = TypeVar("Number", float, Array)
 # The imposed normal load: constant, modulated, or any other; um, s, N.
 
 LoadPiece = Callable[[float], tuple[float, float]]
+RISE = 5.0  # periods over which a modulation rises where nothing else is said, as the format has it
 PIECES_PER_PERIOD = 16  # polynomials per period of a modulation: degree 7 then errs by 4e-13 of its amplitude
 DEGREE = 7
 
@@ -111,7 +112,7 @@ class Modulation(Load):
     eps: float
     f: float
     onset: float = -math.inf
-    rise: float | None = None  # five periods
+    rise: float | None = None  # RISE periods
     phase: float = 0.0
 
     def __post_init__(self) -> None:
@@ -125,7 +126,7 @@ class Modulation(Load):
     @property
     def full(self) -> float:
         """Return the time from which the modulation has its full amplitude."""
-        return self.onset + (5 / self.f if self.rise is None else self.rise)
+        return self.onset + (RISE / self.f if self.rise is None else self.rise)
 
     @property
     def breaks(self) -> tuple[float, ...]:  # type: ignore[override]

@@ -13,7 +13,7 @@ import numpy as np
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.noise import measured
-from srfcli.data.values import AREA_GROWTH, OBSERVABLES, Experiment, Run, Signal
+from srfcli.data.values import AREA_GROWTH, OBSERVABLES, Declared, Experiment, Run, Signal
 from srfcli.motion.simulate import Trace, stick_slip
 from srfcli.results import plots
 from srfcli.results.figures import envelope
@@ -58,7 +58,7 @@ class Job:
     start: Array | None
     observable: str
     ripple: float | None = None
-    modulation: tuple[float, float, float] | None = None
+    modulation: Declared | None = None
     run: Run | None = None
     tables: tuple[Spline, ...] = ()
     beside: tuple[str, ...] = ()  # observables besides
