@@ -137,9 +137,9 @@ def test_comparing_names_what_was_matched() -> None:
     with pytest.raises(srf.SrfError, match="one law"):
         srf.compare({"a": srf.system()})
     laws = {name: srf.system(ageing=name) for name in ("dieterich", "ruina")}
-    small = {"columns": 6, "rows": 8}
+    small = {"columns": 4, "rows": 6}
     found = srf.compare(laws, eps=0.13, V=(5, 40), K_over_W0=(0.006, 0.03), points=small)
-    options = ("--ageing", "dieterich", "--ageing", "ruina", "--over", "V=5:40:6", "--over", "K/W0=0.006:0.03:8")
+    options = ("--ageing", "dieterich", "--ageing", "ruina", "--over", "V=5:40:4", "--over", "K/W0=0.006:0.03:6")
     assert [list(r) for r in found.table.rows] == rows_of("compare", *options, "--eps", "0.13")
     pytest.importorskip("matplotlib")
     named = [text.get_text() for text in found.plot().legends[0].get_texts()]

@@ -160,6 +160,7 @@ def test_coloured_noise_widens_the_errors(recovered):
     assert coloured.stderr["mu0"] > 2.5 * white.stderr["mu0"]  # a mean of AR(1): sqrt((1 + 0.9)/(1 - 0.9)) = 4.4
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_repeats(rock_model):
     found = [fit(fit_problem(rock_model, rock(rock_model, seed=s, lag=0.6, runs=1))) for s in range(10)]
     z = np.array([[(f.values[n] - v) / f.stderr[n] for n, v in ROCK_TRUE.items()] for f in found])

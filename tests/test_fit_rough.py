@@ -204,6 +204,7 @@ def test_what_varies_is_checked_where_it_is_written(line, what, ladder, tmp_path
     assert done.exit_code == 2 and what in done.stderr
 
 
+@pytest.mark.slow
 def test_an_experiment_says_itself_what_a_fit_of_many_steps_needs(ladder, tmp_path, monkeypatch):
     """`srf new` writes what varies, by what, and the trend; with the # taken away the fit is that of the options."""
     monkeypatch.chdir(tmp_path)

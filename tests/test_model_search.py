@@ -121,6 +121,7 @@ def test_what_is_missing_is_named_on_rough_tracks(ageing):
     assert sum(h.gain for h in found.held) > 0
 
 
+@pytest.mark.slow
 def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(ageing, monkeypatch):
     """A search that takes every third reading says what one of all does; its fits are to all, at the same maximum."""
     experiment = read_experiment(ageing, registry=SHIPPED, holdout=False)

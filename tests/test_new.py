@@ -384,7 +384,9 @@ def test_other_commands_given_a_recording_name_this_one(command: str, name: str)
     assert f"srf new {name}" in done.stderr.splitlines()[1]
 
 
-@pytest.mark.parametrize(("path", "stiffness", "unit"), [(B819, "5.4e-3 1/um", "MPa"), (P446, "55 MPa/mm", "MPa")])
+@pytest.mark.parametrize(("path", "stiffness", "unit"), [
+    (B819, "5.4e-3 1/um", "MPa"), pytest.param(P446, "55 MPa/mm", "MPa", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_real_recordings(path: Path, stiffness: str, unit: str) -> None:
     if not path.is_file():
         pytest.skip(f"REFERENCE DATA ABSENT: {path} does not exist; set SRF_SHARED to check against it")

@@ -417,6 +417,28 @@ def test_a_fit_follows_a_ridge_that_bends(make_model):
     assert maximise(likelihood, likelihood.coordinates({**true, **off}), close=0.5).away < 0.5
 
 
+def test_a_maximisation_does_not_end_below_what_it_passed(make_model):
+    """Weights of readings, which lead past false maxima, may lead astray: it then goes on from the likeliest point on the way."""
+    true = {"mu0": 0.43, "A": 0.0128, "B": 0.0263, "D0": 0.38, "lambda": 0.55}
+    names = {"law": "dieterich-ruina", "ageing": "dieterich", "interface": "elastic", "inertia": True}
+    t = np.linspace(0, 3.0, 601)
+    run = recording(t, "elongation", Drive.steps([(0.0, 13.0), (0.5, 7.6)]), ConstantLoad(9.9), stiffness=0.21)
+    listed = tuple(FitParameter(n, v, v / 5, v * 5, False, "1") for n, v in true.items())
+    choice = ModelChoice("dieterich-ruina", "dieterich", "elastic", True)
+    experiment = Experiment(Path(), "slider", choice, 2.37e-6, "0.21 N/um", listed, (run,), ())
+    y = predict(make_model(**names), experiment, run, true).y
+    run = replace(run, observed=y + 0.05 * np.random.default_rng(3).standard_normal(t.size))
+    problem = fit_problem(make_model(**names, random_field=True), replace(experiment, runs=(run,)))
+    likelihood = Likelihood(problem, rtol=1e-3)
+    wide = {"gauge_white": 0.05, "field_amplitude": 0.01, "field_length": 1.0}
+    far = {"A": (0.0128, 0.0145), "B": (0.0331, 0.0418), "D0": (0.242, 0.378), "lambda": (0.632, 0.792)}
+    for k in range(2):
+        said: list[str] = []
+        x = likelihood.coordinates({"mu0": 0.43, **{n: v[k] for n, v in far.items()}, **wide})
+        found = maximise(likelihood, x, steps=12, close=1.0, progress=said.append)
+        assert found.point.log_likelihood > max(float(text.split()[2].rstrip(",")) for text in said) - 2.0
+
+
 @pytest.mark.slow
 def test_a_compliance_is_found_by_how_the_contact_rings(make_model):
     """In stick-slip it rings at 430 Hz, read every 4 ms: one lambda in 0.5 % explains that, and nothing leads there."""
