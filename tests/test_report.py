@@ -292,7 +292,7 @@ def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Pat
     assert ("No place stands out beyond what noise does." in page.text) == nothing
     place = "61 % of the excess misfit is in the run “onset”, most from 1.00 to 1.50 s."
     assert (place in page.text) != nothing
-    assert ("bent B by 10 standard errors" in page.text) != nothing
+    assert ("shifted B by 10 standard errors" in page.text) != nothing
     assert ("leave the same trace" in page.text) == (verdict == "ambiguous")
     assert ("Step the load from 5 to 9 N." in page.text) == (verdict == "ambiguous")
     assert ("second-state: B2 = 0.004 +- 0.0002" in page.text) == (verdict == "ambiguous")

@@ -225,7 +225,7 @@ def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def parameter_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return each parameter under both models, and how far the baseline had bent it, in the final model's standard errors."""
+    """Return each parameter under both models, and the shift of the baseline's, in the final model's standard errors."""
     before, after = parameters_of(diagnosis.shown), parameters_of(diagnosis.final)
     rows = []
     for name in dict.fromkeys([*before, *after]):

@@ -34,7 +34,7 @@ def stability(
 
     `at` are the baseline's fitted parameters; the augmented experiment has its own. Of its effects those `beside` the laws are
     told, or all. Loads are NaN where sliding is steady at any; boundaries under modulation have velocities of their own, NaN
-    between components. Effects that critical loads do not depend on change diagrams by the parameters that they had bent.
+    between components. Effects that critical loads do not depend on change diagrams by the parameters that they shift.
     """
     tables = [t.table for t in baseline.thresholds]
     driven = np.concatenate([*(np.abs(r.drive.velocities) for r in baseline.runs), *(t.V for t in tables)])

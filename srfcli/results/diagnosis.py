@@ -55,7 +55,7 @@ PARAMETERS = (
     Column("augmented", "", "estimate in the final model"),
     Column("augmented_stderr", "", "its standard error", ".2g"),
     Column("unit", "", "of the four before"),
-    Column("bent_by", "", "how far the baseline was off, in the final model's standard errors", ".1f"),
+    Column("shift_sigma", "", "shift of the baseline's estimate, in the final model's standard errors", ".1f"),
 )
 RUNS = (
     Column("run", "", "name"),

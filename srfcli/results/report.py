@@ -47,11 +47,11 @@ if TYPE_CHECKING:
 # What stands in the report of a diagnosis, section by section, from the answer, its material and finished pictures.
 
 RUNS_SHOWN = 12  # runs whose figures are on the page; all are in the folder
-BIASED = 3.0  # standard errors from which a parameter is said to have been bent
+SHIFTED = 3.0  # standard errors from which a parameter is said to be shifted
 WIDTH = 0.05  # of a span: windows that are less apart are one in words
 SHADED = (
     "Shaded are the times at which the baseline parts from the recording, the darker the more; that its parameters may have been "
-    "bent to follow elsewhere is allowed for, so a residual may also be large outside."
+    "shifted to follow elsewhere is allowed for, so a residual may also be large outside."
 )
 FILES = ("answer.json", "prediction-*.csv", "missing-*.csv", "augmented/**/*", "discriminating/**/*", "figures/*.svg")
 
@@ -319,22 +319,22 @@ def scores(matter: Matter) -> Markup:
 
 
 def parameters(matter: Matter) -> Markup:
-    """Return the parameters before and after, and how far they had been bent."""
+    """Return the parameters before and after, and how far they are shifted."""
     found = matter.rows("parameters")
-    rows, bent = [], []
+    rows, shifted = [], []
     for p in found:
         unit = unit_text(p.get("unit"))
         before, after = (with_error(p.get(k), p.get(f"{k}_stderr")) for k in ("baseline", "augmented"))
         shift = p.get("shift_sigma")
-        if finite(shift) and abs(shift) > BIASED:
-            bent.append((abs(shift), p["name"]))
+        if finite(shift) and abs(shift) > SHIFTED:
+            shifted.append((abs(shift), p["name"]))
         shown = matter.sides(before, after, number(shift, 2))
         rows.append([f"{p['name']}" + (f"  [{unit}]" if unit else ""), *shown])
     heads = ["parameter", *matter.sides("baseline", "augmented model", "shift / standard error")]
     parts: list[Any] = []
-    if bent and not matter.same:
-        told = joined([f"{name} by {number(size, 2)}" for size, name in sorted(bent, reverse=True)])
-        parts.append(tag("p", f"To make up for what it lacks, the baseline had bent {told} standard errors."))
+    if shifted and not matter.same:
+        told = joined([f"{name} by {number(size, 2)}" for size, name in sorted(shifted, reverse=True)])
+        parts.append(tag("p", f"To make up for what it lacks, the baseline had shifted {told} standard errors."))
     parts.append(table(heads, rows, numeric=(1, 2, 3)))
     if matter.material.get("alternatives"):
         parts.append(tag("p", "The augmented model of the table is the first of those that do equally well:"))

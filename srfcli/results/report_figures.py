@@ -528,7 +528,7 @@ def _columns(bins: Sequence[Spot], log: bool) -> list[Spot]:
     return [replace(s, low=float(edges[k]), high=float(edges[k + 1])) for k, s in highest.items()]
 
 
-# Figures of what was found: how far parameters had been bent, a missing force, a stability diagram.
+# Figures of what was found: how far parameters are shifted, a missing force, a stability diagram.
 
 FORCE_BINS = 40  # in which a force is averaged along a quantity of state
 STATES = (("v", "slip velocity v  [µm/s]", True), ("phi", "age φ  [s]", True), ("W", "load W  [{}]", False))
@@ -536,7 +536,7 @@ WIDE_QUANTITY = 10.0  # ratio from which a quantity has a logarithmic axis
 
 
 def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
-    """Return how far each parameter of the baseline had been bent, in its own standard errors; None where none is known."""
+    """Return how far each parameter of the baseline is shifted, in its own standard errors; None where none is known."""
     rows = [p for p in parameters if finite(p.get("shift_sigma"))][::-1]
     if not rows:
         return None
