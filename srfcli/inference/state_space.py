@@ -811,6 +811,11 @@ def maximise(
                 slow = slow + 1 if gain < (max(1.0, CREEP * away**2 / 2) if width else close**2 / 8) else 0
                 break
             sure = False  # what may fail is tried without derivatives: a quarter of the work
+            if not felt.all():  # next without what changes nothing here, whose steps may lead anywhere
+                moving, g, I = moving[felt], g[felt], I[np.ix_(felt, felt)]
+                d, size, directions, felt = wide, power, along, felt[felt]
+                steep = directions.T @ (g / d)
+                continue
             if bent or width:
                 damping = max(10 * damping, 1e-3 if width else 1e-6)
             winding = bent = True  # the step is tried bent before it is tried shorter
