@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 from srfcli.codegen.c_source import compiler
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run, Signal
-from srfcli.inference.fit import Interrupted, fit_problem, inverse
+from srfcli.inference.fit import Interrupted, Problem, fit_problem, inverse
 from srfcli.inference.prediction import predict
 from srfcli.inference.state_space import (
     Likelihood,
@@ -400,19 +400,22 @@ def test_a_fit_from_values_30_percent_off_finds_parameters_and_field(make_model,
         assert found.values["field_amplitude"] == pytest.approx(amplitude, rel=0.5)
 
 
+def of_stick_slip(make_model, law: str, true: dict[str, float], samples: int) -> Problem:
+    """Return the problem of three seconds of stick-slip under a law's true parameters, with noise, on a random field."""
+    t = np.linspace(0, 3.0, samples)
+    run = recording(t, "elongation", Drive.steps([(0.0, 13.0), (0.5, 7.6)]), ConstantLoad(9.9), stiffness=0.21)
+    listed = tuple(FitParameter(n, v, v / 5, v * 5, False, "1") for n, v in true.items())
+    names = {"law": law, "ageing": "dieterich", "interface": "elastic", "inertia": True}
+    experiment = Experiment(Path(), "slider", ModelChoice(**names), 2.37e-6, "0.21 N/um", listed, (run,), ())
+    y = predict(make_model(**names), experiment, run, true).y
+    run = replace(run, observed=y + 0.05 * np.random.default_rng(3).standard_normal(t.size))
+    return fit_problem(make_model(**names, random_field=True), replace(experiment, runs=(run,)))
+
+
 def test_a_fit_follows_a_ridge_that_bends(make_model):
     """In stick-slip mu0, Va, Vb and lambda make up for each other along a curve, which straight steps cross to and fro."""
     true = {"mu0": 0.43, "A": 0.0128, "B": 0.0263, "D0": 0.38, "Va": 14_700.0, "Vb": 260.0, "lambda": 0.55}
-    names = {"law": "dieterich-cutoff", "ageing": "dieterich", "interface": "elastic", "inertia": True}
-    drive, t = Drive.steps([(0.0, 13.0), (0.5, 7.6)]), np.linspace(0, 3.0, 751)
-    run = recording(t, "elongation", drive, ConstantLoad(9.9), stiffness=0.21)
-    listed = tuple(FitParameter(n, v, v / 5, v * 5, False, "1") for n, v in true.items())
-    choice = ModelChoice("dieterich-cutoff", "dieterich", "elastic", True)
-    experiment = Experiment(Path(), "slider", choice, 2.37e-6, "0.21 N/um", listed, (run,), ())
-    y = predict(make_model(**names), experiment, run, true).y
-    run = replace(run, observed=y + 0.05 * np.random.default_rng(3).standard_normal(t.size))
-    problem = fit_problem(make_model(**names, random_field=True), replace(experiment, runs=(run,)))
-    likelihood = Likelihood(problem, smooth=True, rtol=1e-3)
+    likelihood = Likelihood(of_stick_slip(make_model, "dieterich-cutoff", true, 751), smooth=True, rtol=1e-3)
     off = {"mu0": 0.418, "Va": 4000.0, "Vb": 244.0, "lambda": 0.47, "gauge_white": 0.05}
     assert maximise(likelihood, likelihood.coordinates({**true, **off}), close=0.5).away < 0.5
 
@@ -420,16 +423,7 @@ def test_a_fit_follows_a_ridge_that_bends(make_model):
 def test_a_maximisation_does_not_end_below_what_it_passed(make_model):
     """Weights of readings, which lead past false maxima, may lead astray: it then goes on from the likeliest point on the way."""
     true = {"mu0": 0.43, "A": 0.0128, "B": 0.0263, "D0": 0.38, "lambda": 0.55}
-    names = {"law": "dieterich-ruina", "ageing": "dieterich", "interface": "elastic", "inertia": True}
-    t = np.linspace(0, 3.0, 601)
-    run = recording(t, "elongation", Drive.steps([(0.0, 13.0), (0.5, 7.6)]), ConstantLoad(9.9), stiffness=0.21)
-    listed = tuple(FitParameter(n, v, v / 5, v * 5, False, "1") for n, v in true.items())
-    choice = ModelChoice("dieterich-ruina", "dieterich", "elastic", True)
-    experiment = Experiment(Path(), "slider", choice, 2.37e-6, "0.21 N/um", listed, (run,), ())
-    y = predict(make_model(**names), experiment, run, true).y
-    run = replace(run, observed=y + 0.05 * np.random.default_rng(3).standard_normal(t.size))
-    problem = fit_problem(make_model(**names, random_field=True), replace(experiment, runs=(run,)))
-    likelihood = Likelihood(problem, rtol=1e-3)
+    likelihood = Likelihood(of_stick_slip(make_model, "dieterich-ruina", true, 601), rtol=1e-3)
     wide = {"gauge_white": 0.05, "field_amplitude": 0.01, "field_length": 1.0}
     far = {"A": (0.0128, 0.0145), "B": (0.0331, 0.0418), "D0": (0.242, 0.378), "lambda": (0.632, 0.792)}
     for k in range(2):

@@ -325,8 +325,8 @@ def test_the_share_of_a_modulation_is_found_from_the_loads(tmp_path: Path, measu
     assert found.stderr["rho"] < 0.05
 
 
-@pytest.mark.parametrize(("free", "bent"), [(("A", "B"), False), (("A", "B", "D0"), True)])
-def test_errors_that_a_ridge_makes_too_small_are_told(tmp_path: Path, model: Any, free: tuple[str, ...], bent: bool) -> None:
+@pytest.mark.parametrize(("free", "wrong"), [(("A", "B"), False), (("A", "B", "D0"), True)])
+def test_errors_that_a_ridge_makes_too_small_are_told(tmp_path: Path, model: Any, free: tuple[str, ...], wrong: bool) -> None:
     """Of loads without modulation: 95 % intervals of A, B and D0 hold the truth in 70 % of 30 draws, those of A and B in 93 %."""
     base = model.defaults()
     table = with_noise(generated(model, np.array([1.0, 5.0, 10.0, 50.0, 100.0]), np.zeros(5), values=base), 2)
@@ -334,8 +334,8 @@ def test_errors_that_a_ridge_makes_too_small_are_told(tmp_path: Path, model: Any
     head = HEAD.format(model="", parameters="").partition("[parameters]")[0]
     folder = folder_of(tmp_path, f"{head}[parameters]\n{rows}{TABLE}", loads=table)
     told = [n for n in srf.fit(folder).table.notes if "not quadratic" in n]
-    assert len(told) == bent
-    if bent:
+    assert len(told) == wrong
+    if wrong:
         assert "A, B, D0" in told[0] and "--profile" in told[0]
         profiled = srf.fit(folder, profile=True)
         row = {r["parameter"]: r for r in profiled.table.records()}["D0"]

@@ -670,8 +670,10 @@ def load_of(run: RunDescription, columns: Columns, unit: str) -> tuple[Load, lis
 def declared_load(W0: float, modulation: Declared) -> Modulation:
     """Return the load of a declared modulation: frequency (Hz), amplitude, onset (s), and, if given, phase (deg) and rise (s)."""
     f, eps, onset, *more = modulation
-    phase, rise = more or (0.0, None)
-    return Modulation(W0, eps, f, onset, rise, math.radians(phase or 0.0))
+    if not more:
+        return Modulation(W0, eps, f, onset)
+    phase, rise = more
+    return Modulation(W0, eps, f, onset, rise, math.radians(phase))
 
 
 def load_from_column(place: Place, W: Array, unit: str = "N") -> tuple[Load, list[Notice]]:

@@ -768,8 +768,8 @@ def maximise(
             d, size, directions = _scaled(I)
             steep = directions.T @ (g / d)
             felt = np.diag(I) * (likelihood.upper - likelihood.lower)[moving] ** 2 > UNFELT
-            wide, power, along = (d, size, directions) if felt.all() else _scaled(I[np.ix_(felt, felt)])
-            away = float(np.sqrt(np.sum((along.T @ (g[felt] / wide)) ** 2 / power)))
+            wide, power, ways = (d, size, directions) if felt.all() else _scaled(I[np.ix_(felt, felt)])
+            away = float(np.sqrt(np.sum((ways.T @ (g[felt] / wide)) ** 2 / power)))
             if not width or (away > np.sqrt(moving.size) and slow < 2):  # farther than chance would have it
                 break
             left, slow, damping = left[1:], 0, 1e-3
@@ -813,7 +813,7 @@ def maximise(
             sure = False  # what may fail is tried without derivatives: a quarter of the work
             if not felt.all():  # next without what changes nothing here, whose steps may lead anywhere
                 moving, g, I = moving[felt], g[felt], I[np.ix_(felt, felt)]
-                d, size, directions, felt = wide, power, along, felt[felt]
+                d, size, directions, felt = wide, power, ways, felt[felt]
                 steep = directions.T @ (g / d)
                 continue
             if bent or width:

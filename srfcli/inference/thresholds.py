@@ -380,8 +380,8 @@ class MethodFit:
 class ThresholdFit:
     """A table fitted by one or both methods; `status` is the worst of theirs.
 
-    `intervals` are by the profile likelihood from the lowest chi2, where they were asked for; without them `bent` are the
-    parameters whose standard errors promise another chi2 than there is at their ends.
+    `intervals` are by the profile likelihood from the lowest chi2, where they were asked for; without them `not_quadratic`
+    are the parameters whose standard errors promise another chi2 than there is at their ends.
     """
 
     table: Thresholds
@@ -389,7 +389,7 @@ class ThresholdFit:
     methods: tuple[MethodFit, ...]
     status: Status
     intervals: tuple[Interval, ...] = ()
-    bent: tuple[str, ...] = ()
+    not_quadratic: tuple[str, ...] = ()
 
     @property
     def best(self) -> MethodFit:
@@ -492,7 +492,9 @@ def fit_thresholds(
         return done
     work = _Work(Matcher(model, table, values=values, scale=scale, tol=tol), "profile", sys.maxsize, report)
     try:
-        return replace(done, intervals=_profiles(work, done.best)) if profile else replace(done, bent=_bent(work, done.best))
+        if profile:
+            return replace(done, intervals=_profiles(work, done.best))
+        return replace(done, not_quadratic=_not_quadratic(work, done.best))
     except KeyboardInterrupt:
         return replace(done, status=Status.INTERRUPTED)
 
@@ -504,7 +506,7 @@ def _ridge(scale: Scale, best: MethodFit, k: int) -> tuple[float, Array]:
     return float(errors[k]), moves
 
 
-def _bent(work: _Work, best: MethodFit) -> tuple[str, ...]:
+def _not_quadratic(work: _Work, best: MethodFit) -> tuple[str, ...]:
     """Return the parameters at whose ends of 1.96 standard errors, the others by correlation, chi2 is not that promised."""
     scale, found = work.matcher.scale, []
     for k, name in enumerate(scale.names):

@@ -373,7 +373,7 @@ class FitResult(Result):
             return farther(self.intervals, [fit.values[n] for n in names], [fit.stderr[n] for n in names], bounds)
         if not (found.problem.tables and found.state_space and found.status.ok):
             return []
-        return bent(not_quadratic(found.state_space))
+        return said_not_quadratic(not_quadratic(found.state_space))
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return each run's recording and prediction above its residual, and each table's measured and computed loads."""
@@ -433,7 +433,7 @@ def load_rows(table: Thresholds, match: Match) -> list[tuple[Any, ...]]:
     return [tuple(v.item() if hasattr(v, "item") else v for v in row) for row in zip(*cells, strict=True)]
 
 
-def bent(names: Sequence[str]) -> list[str]:
+def said_not_quadratic(names: Sequence[str]) -> list[str]:
     """Return a sentence on parameters whose standard errors do not say how the likelihood falls off, if there are any."""
     told = f"the likelihood is not quadratic within 1.96 standard errors of {', '.join(names)}"
     return [f"{told}, which may be far too small: --profile gives intervals that hold"] if names else []
@@ -611,7 +611,7 @@ class ThresholdFitResult(Result):
         """Return which standard errors are too small by the intervals; without any, whether they may be."""
         fit, best = self.found, self.found.best
         if not fit.intervals:
-            return bent(fit.bent)
+            return said_not_quadratic(fit.not_quadratic)
         bounds = [(q.lower, q.upper) for q in fit.scale]
         return farther(fit.intervals, best.values.tolist(), best.uncertainty.errors.tolist(), bounds)
 
