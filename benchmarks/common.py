@@ -5,6 +5,7 @@ Import this before NumPy: it fixes the number of threads.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -25,6 +26,11 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 for _folder in (ROOT / "tests", ROOT):
     if str(_folder) not in sys.path:
         sys.path.insert(0, str(_folder))
+
+
+def no_arguments(about: str | None) -> None:
+    """Print what a script measures where `--help` is asked, and refuse any other argument."""
+    argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
 
 
 class Report:

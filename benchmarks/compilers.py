@@ -21,6 +21,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from common import no_arguments
 
 from srfcli.codegen.c_source import _build, _methods, compiler, filter_source, integrator_source
 from srfcli.codegen.model import GeneratedModel, open_model
@@ -57,6 +58,7 @@ def with_numba(model: GeneratedModel) -> float:
 
 
 def main() -> None:
+    no_arguments(__doc__)
     registry = load_registry()
     model = open_model(registry, random_field=True)
     texts = {"integrator": integrator_source(model), "filter": filter_source(model)}

@@ -17,7 +17,7 @@ import time
 
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
-from common import Report
+from common import Report, no_arguments
 
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.laws.registry import bundled_registry
@@ -60,6 +60,7 @@ def lacking(these: list[float], those: list[float]) -> list[float]:
 
 def main() -> None:
     """Compare line by line and print what differs."""
+    no_arguments(__doc__)
     report = Report("crossings", __doc__)
     rows, told = [], []
     agreeing = lines = crossings = 0

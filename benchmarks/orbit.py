@@ -31,7 +31,7 @@ from functools import partial
 import common  # before NumPy: it fixes the number of threads
 import numpy as np
 from brute import Slider, steady
-from common import Report, interleaved, repeated
+from common import Report, interleaved, no_arguments, repeated
 from scipy.integrate import solve_ivp
 
 from srfcli.codegen.model import GeneratedModel, open_model
@@ -219,6 +219,7 @@ def compare(model: GeneratedModel, V: float, W0: float, crossing: int, goal: flo
 
 def main() -> None:
     """Compare on the branches of VELOCITIES and print one table for each goal."""
+    no_arguments(__doc__)
     report = Report("orbit", __doc__)
     assert common.ROOT.exists()
     model = open_model(load_registry())

@@ -31,7 +31,7 @@ from typing import Any
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
 from brute import Slider, steady
-from common import Report, interleaved
+from common import Report, interleaved, no_arguments
 
 from srfcli.codegen.model import open_model
 from srfcli.laws.registry import load_registry
@@ -241,6 +241,7 @@ def measure(report: Report, methods: Methods, record: Record) -> dict[str, tuple
 
 def main() -> None:
     """Print times and errors, then the ratios at equal error."""
+    no_arguments(__doc__)
     report = Report("simulate", __doc__ or "")
     methods = Methods()
     if methods.lsoda is None:

@@ -20,7 +20,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from common import ROOT, Report
+from common import ROOT, Report, no_arguments
 
 REPEATS = 9
 PYC = Path(tempfile.mkdtemp())  # compiled once by the runs that are not counted, as an installation does
@@ -62,6 +62,7 @@ def modules_of_help() -> list[str]:
 
 def main() -> None:
     """Time the starts in turn and print two tables."""
+    no_arguments(__doc__)
     report = Report("startup", __doc__)
     folder = Path(tempfile.mkdtemp())
     warm = folder / "warm"

@@ -12,6 +12,7 @@ from srfcli.codegen.c_source import compiler
 from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import grouped
 from srfcli.data.values import FitParameter
+from srfcli.diagnosis import search as of_search
 from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.scores import Remainder, Scores
 from srfcli.diagnosis.search import ModelSearch
@@ -119,6 +120,16 @@ def test_what_is_missing_is_named_on_rough_tracks(ageing):
     error = np.sqrt(np.diag(best.maximum.covariance))[best.likelihood.names.index("alpha")]
     assert abs(best.values["alpha"] - 0.03) < 3.5 * error
     assert sum(h.gain for h in found.held) > 0
+
+
+def test_a_search_without_budget_ends_at_the_baseline_and_says_so(ageing, monkeypatch):
+    """A fit under way is given up; scores are there all the same, and a baseline that passes is not said to lack nothing."""
+    monkeypatch.setattr(of_search, "BUDGET", 0.0)
+    monkeypatch.setattr(of_search, "BASELINES", 0.0)
+    found = said(ageing)
+    assert [f.name for f in found.ranked] == ["none"] and found.verdict == "inconclusive"
+    assert {s.effect.reported for s in found.scores} >= {"linker-dieterich", "viscous-drag"}
+    assert any("the search ended at its budget" in reason for reason in found.reasons)
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ def fitted(*names, evidence, passes=True, scores=(), told=0.0):
 def held(rms, gain=1.0, whole=True):
     white = rms * np.where(np.arange(400) % 2, 1.0, -1.0)
     told = SimpleNamespace(rms=rms)
-    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain, predictive=(told, told), loud="")
+    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain, predictive=told, loud="")
 
 
 @pytest.fixture
@@ -76,6 +76,12 @@ def test_a_model_that_passes_is_taken_where_one_that_does_not_is_hardly_ahead_of
 def test_a_search_that_its_budget_ended_says_so(concluded, cut_short):
     found = concluded(fitted("viscous-drag", evidence=100.0), LOST, cut_short=cut_short)
     assert any("budget of 150 s" in r for r in found.reasons) is cut_short
+
+
+def test_nothing_is_said_to_be_missing_only_where_all_that_promised_was_fitted(concluded):
+    scores = [score("viscous-drag", SEEN)]
+    assert concluded(fitted(evidence=0.0, scores=scores)).verdict == "none"
+    assert concluded(fitted(evidence=0.0, scores=scores), cut_short=True).verdict == "inconclusive"
 
 
 def test_a_further_effect_that_gains_little_is_not_named(concluded):

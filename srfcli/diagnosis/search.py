@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -119,6 +119,9 @@ class Fitted:
         return self.scores.singles if self.scores else ()
 
 
+_Step = tuple[Callable[[Fitted], Any], Fitted]  # what the search does with a model that is the best, or with the baseline
+
+
 @dataclass(order=True)
 class _Move:
     """A model to be fitted: what its evidence is expected to be, negative, as a heap gives the smallest first."""
@@ -133,6 +136,10 @@ class _Move:
     direction: Array | None = field(compare=False, default=None)  # of what its last effect is expected to explain
     shifts: Mapping[str, float] = field(compare=False, default_factory=dict)  # of other parameters that go with that
     origin: StateSpaceFit | None = field(compare=False, default=None)  # whose parameters it begins with, as they are
+
+
+class _Spent(Exception):
+    """The budget is used up."""
 
 
 class ModelSearch:
@@ -153,7 +160,7 @@ class ModelSearch:
         effects: Sequence[str] | None = None,
         trend: str | None = None,
     ) -> None:
-        self.registry, self.whole, self.progress = registry, experiment, progress
+        self.registry, self.whole, self._told = registry, experiment, progress
         self.trend = trend or experiment.trend  # of every fit
         self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs))
         self.candidates, self.excluded = applicable(registry, experiment, effects)
@@ -161,10 +168,28 @@ class ModelSearch:
         self.on_request = [e.name for e in every if effects is None and e.on_request]
         self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]
         self.budget, self.begun, self.cut_short = BUDGET, time.process_time(), False
+        self.bounded = False  # whether what is done now ends with the budget
         self.fitted: dict[str, Fitted] = {}
         self.queue: list[_Move] = []
         self.count = 0
+        self._taken: set[tuple[Callable[[Fitted], Any], str]] = set()  # steps, and of which model
         self._tried: dict[str, Array] = {}  # from where each other ageing law was tried last
+
+    def progress(self, text: str) -> None:
+        """Tell what is done; where the budget is spent, end what is bounded by it."""
+        self._told(text)
+        if self.bounded and self.spent:
+            raise _Spent
+
+    @contextlib.contextmanager
+    def within_budget(self) -> Iterator[None]:
+        """Do what follows until it is done or the budget is spent: what was fitted until then is kept."""
+        self.bounded = True
+        try:
+            with contextlib.suppress(_Spent):
+                yield
+        finally:
+            self.bounded = False
 
     # ------------------------------------------------------------------ models and their fits
 
@@ -268,6 +293,10 @@ class ModelSearch:
             tuple(shortcomings(found)), remainder, max(remainder.shared.gain - NEEDED, 0.0) if random else None,
         )  # fmt: skip
 
+    def _passed(self, hypothesis: Hypothesis, found: StateSpaceFit) -> Fitted:
+        """Return a model where scoring has passed, which is scored and no more."""
+        return Fitted(hypothesis, found, found.log_likelihood, 0.0, ("as it is passed",), self.remainder(found))
+
     def _prior(self, hypothesis: Hypothesis) -> float:
         """Return the log prior of a model: each effect is one of those that there are, and halves its share.
 
@@ -289,42 +318,23 @@ class ModelSearch:
     # ------------------------------------------------------------------ the search
 
     def run(self) -> Fitted:
-        """Return the best model; `ranked` has all that were fitted."""
+        """Return the best model; `ranked` has all that were fitted.
+
+        First-order scores and fits from one start mislead. So each model that is the best when nothing is left that promises to
+        come close is asked in turn what may have misled, and the search goes on with what that brings.
+        """
         self.progress("baseline")
         base = self._with_own_noise(self._record(self.fit(None)))
         self.budget = max(BUDGET, BASELINES * (time.process_time() - self.begun))
-        if taken_up(base.fit):
-            self._fit_at_the_file()
-        base = self._expand(base)
-        if not base.passes:
-            self._try_ageing_laws(base)
-        self._search()
-        self._refit_elsewhere(base)
-        if self.best().name == base.name or not self.best().passes:
-            self._expand_without_field(self.baseline)
-        if self.best().name != base.name and not self.best().passes:
-            self._expand_without_field(self.best())
-        if not (self.best().passes or self.spent):
-            self._with_own_noise(self.best())
-            self._refit_noise(self.baseline)
-            self._search()
-        if not self.spent:  # an effect, or the field beside the baseline, may pass for another ageing law
-            self._try_ageing_laws(self.baseline, afresh=True)
-            self._search()
-        if self.best().hypothesis.ageing and not self.spent:  # another law is much like it; its noise may have been misjudged
-            for again in (self._try_ageing_laws, self._refit_noise):
-                again(self.baseline)
-                self._search()
-        if not self.spent:
-            self._try_rivals()
-            self._search()
-        self._where_effects_act()
-        self._eliminate()
-        simplest = self.best()
-        self._search()  # a simpler model that is the best now was not asked yet what it lacks
-        if self.best().name != simplest.name:
-            self._where_effects_act()
-            self._eliminate()
+        with self.within_budget():
+            if taken_up(base.fit):
+                self._fit_at_the_file()
+            base = self._expand(base)
+            if not base.passes:
+                self._try_ageing_laws(base)
+            self._ask(self._steps)
+        if self.best().passes:
+            self._ask(self._simplifying)
         if self.baseline.scores is None:  # from the best model's parameters it came to another maximum
             self._expand(self.baseline)
         best = self.best()
@@ -332,6 +342,34 @@ class ModelSearch:
         if self.experiment.runs is not self.whole.runs:
             self._fit_all()
         return self.best()
+
+    def _ask(self, steps: Callable[[], Sequence[_Step]]) -> None:
+        """Search, and take the first step that was not taken yet for its model, until none is left."""
+        while True:
+            self._search()
+            step, node = next(((s, f) for s, f in steps() if (s, f.name) not in self._taken), (None, None))
+            if step is None or node is None:
+                return
+            step(node)
+            self._taken.add((step, node.name))
+
+    def _steps(self) -> list[_Step]:
+        """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
+        best, base = self.best(), self.baseline
+        steps: list[_Step] = []
+        if not best.passes:
+            steps += [(self._refit_elsewhere, best), (self._expand_without_field, base), (self._expand_without_field, best)]
+            steps += [(self._with_own_noise, best), (self._refit_noise, best)]
+        elif best.name == base.name:
+            steps.append((self._expand_without_field, base))
+        steps.append((self._try_laws_from_the_file, base))
+        if best.hypothesis.ageing:
+            steps.append((self._try_laws_like, best))
+        return [*steps, (self._try_rivals, best), *self._simplifying()]
+
+    def _simplifying(self) -> list[_Step]:
+        """Return the steps that lead from the model that is the best now to others that are as simple, or simpler."""
+        return [(step, self.best()) for step in (self._in_all_runs, self._in_one_run, self._eliminate)]
 
     def _fit_all(self) -> None:
         """Fit the baseline, and what comes close to the best, to all readings; the others were not."""
@@ -351,10 +389,11 @@ class ModelSearch:
         """Search on from models that another search has fitted."""
         for node in nodes:
             self.fitted[node.name] = node
-        for node in nodes:
-            self._expand(node)
-        self._search()
-        self._eliminate()
+        with self.within_budget():
+            for node in nodes:
+                self._expand(node)
+            self._search()
+            self._eliminate(self.best())
 
     @property
     def share(self) -> float:
@@ -472,20 +511,18 @@ class ModelSearch:
 
         Under a field that no track has, the scores of what is missing are as low as those of what is not.
         """
-        if self.spent or len(node.hypothesis.effects) == MOST_EFFECTS or not taken_up(node.fit):
+        if len(node.hypothesis.effects) == MOST_EFFECTS or not taken_up(node.fit):
             return
         problem = node.fit.likelihood.problem
-        try:
-            start = _followable(node.fit.values, problem)
-            found = self._state_space(problem, start=start, smooth=True, processes=(), beside=False)
-            plain = self._judged(node.hypothesis, found)
-        except SrfError:  # without a field nothing follows the recordings
+        bare = Likelihood(problem, smooth=True, rtol=SEARCH_RTOL)
+        found = maximise(bare, bare.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
+        if found.status is Status.INTEGRATION:  # without a field nothing follows the recordings
             return
+        plain = self._passed(node.hypothesis, StateSpaceFit(bare, found))
         self.progress(f"{node.name}: scores without field and colour")
         scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, self._joining(node))
         for promised in ([(s.gain, s) for s in scores.every], [(s.gain - self._rarer, s) for s in scores.alone]):
             self._push(self._promised(node, plain, promised, WORTH, noise=False))  # as many in one run alone as in all
-        self._search()
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""
@@ -544,27 +581,22 @@ class ModelSearch:
             return
         self.progress("scores at the start values")
         found = StateSpaceFit(likelihood, maximise(likelihood, x, steps=0, widths=()))
-        node = Fitted(Hypothesis(), found, found.log_likelihood, 0.0, ("as it begins",), self.remainder(found))
+        node = self._passed(Hypothesis(), found)
         scores = Scores(self.registry, likelihood.problem.experiment, node.remainder, (), self._joining(node))
         wide = {n: found.values[n] for n in FIELD}
         for move in self._promised(node, node, self._gains(scores), WORTH, noise=False)[:1]:
             with contextlib.suppress(SrfError):  # it cannot be followed from there
                 self._record(self.fit(replace(move, values=move.values | wide)))
 
-    def _refit_elsewhere(self, base: Fitted) -> None:
-        """Fit the best model anew where a scan, or another size of what is built in, leads somewhere likelier.
-
-        And the one that is the best then, as long as it fails a test and is not the baseline.
-        """
-        tried = {base.name}
-        while not ((node := self.best()).name in tried or node.passes or self.spent):
-            tried.add(node.name)
-            found = self._scanned(node) or self._resized(node)
-            if found is not None and found.log_likelihood > node.fit.log_likelihood + NEEDED:
-                values = dict(found.values)
-                with contextlib.suppress(SrfError):  # else it stays as it was
-                    self._record(self.fit(_Move(0.0, 0, node.hypothesis, values, self._sizes(node, values))))
-            self._search()
+    def _refit_elsewhere(self, node: Fitted) -> None:
+        """Fit a model that fails a test anew where a scan, or another size of what is built in, leads somewhere likelier."""
+        if node.name == self.baseline.name:
+            return
+        found = self._scanned(node) or self._resized(node)
+        if found is not None and found.log_likelihood > node.fit.log_likelihood + NEEDED:
+            values = dict(found.values)
+            with contextlib.suppress(SrfError):  # else it stays as it was
+                self._record(self.fit(_Move(0.0, 0, node.hypothesis, values, self._sizes(node, values))))
 
     def _scanned(self, node: Fitted) -> Point | None:
         """Return the likeliest point that scans of parameters with narrow maxima lead to, None where it is no likelier."""
@@ -595,14 +627,13 @@ class ModelSearch:
         likeliest = max(trials, key=lambda f: f.point.log_likelihood)
         return maximise(likelihood, likeliest.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress).point
 
-    def _refit_noise(self, base: Fitted) -> None:
+    def _refit_noise(self, best: Fitted) -> None:
         """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""
-        best = self.best()
         if "processes" in self.options or correlated(best.fit.maximum.point) < DEVIATION:
             return
         processes = self._refitted(best, None).fit.likelihood.processes
         if processes != best.fit.likelihood.processes:
-            for node in {f.name: f for f in (base, *self.ranked()[:MOST_FOLLOWED])}.values():
+            for node in {f.name: f for f in (self.baseline, *self.ranked()[:MOST_FOLLOWED])}.values():
                 if node.fit.likelihood.processes != processes:
                     self._refitted(node, processes)
             self.queue.clear()
@@ -615,21 +646,26 @@ class ModelSearch:
         """
         if GAUGE_NOISE in self.experiment.vary or not uneven_noise(node.fit):
             return node
-        before = self.experiment, self.whole
+        before, done = (self.experiment, self.whole, self.fitted), False
         self.experiment, self.whole = (
-            replace(e, vary=(*e.vary, GAUGE_NOISE), by=e.by if e.vary else "run") for e in before
+            replace(e, vary=(*e.vary, GAUGE_NOISE), by=e.by if e.vary else "run") for e in before[:2]
         )  # fmt: skip
-        problem = self._problem(node.hypothesis, node.fit.values)
-        found = self._state_space(problem, start=_followable(node.fit.values, problem), **{**self.options, "cautious": True})
-        loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
-        if loud or log_evidence(found) < log_evidence(node.fit) + CLOSE:
-            self.experiment, self.whole = before
-            return node
-        others = [f for f in (self.baseline, *self.ranked()[:MOST_FOLLOWED]) if f.name != node.name]
-        self._record(self._judged(node.hypothesis, found), anew=True)
-        for other in others:
-            self._refitted(other, found.likelihood.processes)
-        self.queue.clear()
+        self.fitted = dict(self.fitted)
+        try:
+            problem = self._problem(node.hypothesis, node.fit.values)
+            found = self._state_space(problem, start=_followable(node.fit.values, problem), **{**self.options, "cautious": True})
+            loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
+            if loud or log_evidence(found) < log_evidence(node.fit) + CLOSE:
+                return node
+            others = [f for f in (self.baseline, *self.ranked()[:MOST_FOLLOWED]) if f.name != node.name]
+            self._record(self._judged(node.hypothesis, found), anew=True)
+            for other in others:
+                self._refitted(other, found.likelihood.processes)
+            self.queue.clear()
+            done = True
+        finally:
+            if not done:
+                self.experiment, self.whole, self.fitted = before
         return self.fitted[node.name]
 
     def _refitted(self, node: Fitted, processes: Sequence[str] | None) -> Fitted:
@@ -642,13 +678,12 @@ class ModelSearch:
         except SrfError:  # it stays as it was
             return node
 
-    def _try_rivals(self) -> None:
+    def _try_rivals(self, best: Fitted) -> None:
         """Fit what does the same at first order in the place of one effect of the best model, or of its ageing law.
 
         The best model absorbs such an effect, and what is left of the best without its own does not. An ageing law is as likely
         at the parameters of the best.
         """
-        best = self.best()
         effects, ageing, sizes = best.hypothesis.effects, best.hypothesis.ageing, self._sizes(best)
         if not best.passes or best.scores is None:
             return
@@ -679,6 +714,14 @@ class ModelSearch:
         first, *_ = (*score.effect.sizes, *score.effect.frees)
         begun = neutral_values(score.effect).get(first, fitted.get("K", self.experiment.stiffness))
         return {**score.values, first: begun + ratio * score.size}
+
+    def _try_laws_from_the_file(self, node: Fitted) -> None:
+        """Push the other ageing laws, the file's own values tried, too: an effect, or the field, may pass for another law."""
+        self._try_ageing_laws(node, afresh=True)
+
+    def _try_laws_like(self, best: Fitted) -> None:
+        """Push the other ageing laws from where the best model, one of them, stands: another may be much like it."""
+        self._try_ageing_laws(self.baseline)
 
     def _try_ageing_laws(self, node: Fitted, *, afresh: bool = False) -> None:
         """Push the other ageing laws, each after a few steps from where the model or the best one stands.
@@ -726,18 +769,18 @@ class ModelSearch:
         noise = {n: v for n, v in values.items() if n not in own.problem.names and n not in FIELD}
         return next(iter(wide_starts(own, noise, self.progress)), own.coordinates(noise))
 
-    def _where_effects_act(self) -> None:
-        """Fit the best model with its effects in all runs where one acts in one, and in one where the others do not need it.
-
-        Another effect that was missing may have misled the score of one run; recordings that hardly see an effect do not tell
-        whether they have it, and held-out runs then do.
-        """
-        best = self.best()
-        effects, ageing = best.hypothesis.effects, best.hypothesis.ageing
-        whole = Hypothesis(tuple(replace(e, run="") for e in effects), ageing)
+    def _in_all_runs(self, best: Fitted) -> None:
+        """Fit the best model with its effects in all runs: the score of one run may have been misled by what was missing then."""
+        whole = Hypothesis(tuple(replace(e, run="") for e in best.hypothesis.effects), best.hypothesis.ageing)
         if whole.name not in self.fitted:
             self._fit_from(best, whole, self._sizes(best))
-            self._search()
+
+    def _in_one_run(self, best: Fitted) -> None:
+        """Fit the best model with each of its effects in the one run that needs it most, where the others hardly see it.
+
+        Held-out runs then tell whether these have it.
+        """
+        effects, ageing = best.hypothesis.effects, best.hypothesis.ageing
         for i, effect in enumerate(effects if len(self.experiment.runs) > 1 else ()):
             if effect.run or not may_befall_one_run(effect):
                 continue
@@ -757,7 +800,7 @@ class ModelSearch:
         except SrfError as error:
             self.excluded.append(Excluded(hypothesis.name, error.message))
 
-    def _eliminate(self) -> None:
+    def _eliminate(self, best: Fitted) -> None:
         """Refit the best model, and what comes close, with one part less from its parameters (backward elimination).
 
         Of several parts each is left out, and what the best has of one: a fit from the file may have ended at a lower maximum.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -42,16 +43,13 @@ UNEXPLAINED, MISSED = 0.16, 0.37
 class Held:
     """One held-out run filtered under the baseline and under the best model, both as they were fitted to the other runs.
 
-    `shown` is that of the baseline with the best model's field and gauge noise. `predictive` says how well each of the first two
-    predicts it, with parameters as uncertain as their fits leave them. `loud` says whether the best model needs more gauge noise
-    than the run shows, where no run that was fitted has its noise.
+    `shown` is that of the baseline with the best model's field and gauge noise; `models` are the two.
     """
 
     baseline: Filtered
     augmented: Filtered
     shown: Filtered
-    predictive: tuple[Predictive, Predictive]
-    loud: str = ""
+    models: tuple[Fitted, Fitted] = field(repr=False)
 
     @property
     def run(self) -> Run:
@@ -59,9 +57,22 @@ class Held:
         return self.baseline.run
 
     @property
+    def predictive(self) -> Predictive:
+        """Return how well the best model predicts it, with parameters as uncertain as its fit leaves them."""
+        return self.models[1].predictive(self.run)
+
+    @property
     def gain(self) -> float:
         """Return what the best model gains in log marginal likelihood."""
-        return self.predictive[1].log_likelihood - self.predictive[0].log_likelihood
+        return self.predictive.log_likelihood - self.models[0].predictive(self.run).log_likelihood
+
+    @property
+    def loud(self) -> str:
+        """Return whether the best model needs more gauge noise than the run shows, where no run that was fitted has its noise."""
+        if not self.models[1].fit.likelihood.noisy_alone(self.run):
+            return ""
+        own = self.predictive.fit
+        return next((text for size, text in loudness(own.likelihood, own.maximum.point) if size > 1.0), "")
 
 
 @dataclass(frozen=True)
@@ -141,7 +152,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     shown = on_the_track_of(best, baseline) if best.passes else baseline
     held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
     scores = tuple(baseline.promised)
-    ungated, reasons = _said(best, close, scores)
+    ungated, reasons = _said(best, close, scores, search.cut_short)
     refused = refusal(best, baseline, held, held_loads) if ungated != "unknown" else ""
     verdict = "unknown" if refused else ungated
     if refused:
@@ -186,9 +197,10 @@ def unsteady_start(search: ModelSearch, best: Fitted) -> list[str]:
         return []
     runs = tuple(replace(run, initial="free") for run in experiment.runs)
     problem = Hypothesis().problem(search.registry, replace(experiment, runs=runs), trend=search.trend)
-    try:
-        found = fit_state_space(problem, cautious=True, beside=False, close=NEAR, rtol=SEARCH_RTOL)
-    except SrfError:
+    found = None
+    with contextlib.suppress(SrfError), search.within_budget():
+        found = fit_state_space(problem, cautious=True, beside=False, close=NEAR, rtol=SEARCH_RTOL, progress=search.progress)
+    if found is None:
         return []
     gain = log_evidence(found) - best.separate
     then = "" if shortcomings(found) else ", and every test is passed"
@@ -203,8 +215,9 @@ def not_the_same(baseline: Fitted, best: Fitted) -> list[str]:
     least = max(gains, default=0.0) if best is not baseline else WORTH
     if own is None or own.gain < max(least, WORTH):
         return []
-    value = baseline.fit.values[own.parameter]
-    said = f"{own.parameter} of {own.run} alone, about {value + own.change:.3g} where the baseline has {value:.3g}"
+    value, unit = baseline.fit.values[own.parameter], baseline.fit.likelihood.problem.unit_of(own.parameter)
+    there, here = (f"{from_base(x, unit):.3g}{'' if unit == '1' else ' ' + unit}" for x in (value + own.change, value))
+    said = f"{own.parameter} of {own.run} alone, about {there} where the baseline has {here}"
     return [f"{said}, would gain {own.gain:.0f} in log likelihood: --vary {own.parameter}"]
 
 
@@ -302,11 +315,7 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
     found = []
     for run in (run for run in whole.runs if run.holdout):
         first, last, seen = (f.fit.likelihood.held_out(run, f.fit.values) for f in models)
-        before, after, loud = baseline.predictive(run), best.predictive(run), ""
-        if best.fit.likelihood.noisy_alone(run):
-            own = loudness(after.fit.likelihood, after.fit.maximum.point)
-            loud = next((text for size, text in own if size > 1.0), "")
-        found.append(Held(first, last, seen, (before, after), loud))
+        found.append(Held(first, last, seen, (baseline, best)))
     return tuple(found)
 
 
@@ -321,11 +330,13 @@ def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[H
     return tuple(found)
 
 
-def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score]) -> tuple[str, list[str]]:
+def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score], cut_short: bool) -> tuple[str, list[str]]:
     if not best.passes:
         return "unknown", [f"{best.name}: {reason}" for reason in best.against]
     reasons = [f"{best.name}: nothing is left that a test finds"]
     if any(not f.hypothesis.reported for f in close):
+        if cut_short:
+            return "inconclusive", [*reasons, "models that may explain more were not fitted"]
         seen = [s for s in scores if s.detectable < interesting(s)]
         if 2 * len(seen) >= len(scores):
             return "none", [*reasons, "the baseline explains the recordings"]
@@ -354,7 +365,7 @@ def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequenc
         return "held-out runs cannot be followed"
     if loud := next((f"{h.run.name}: {h.loud}" for h in held if h.loud), ""):
         return f"held-out runs are not predicted: in {loud}"
-    sizes, levels = [h.augmented.white.size for h in held], [h.predictive[1].rms for h in held]
+    sizes, levels = [h.augmented.white.size for h in held], [h.predictive.rms for h in held]
     rms = float(np.sqrt(np.average(np.square(levels), weights=sizes)))
     if not rms < HELD_OUT_RMS:
         return f"held-out runs are not predicted: innovations have an rms of {rms:.3f} with the parameters moved as they may"
