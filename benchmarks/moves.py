@@ -29,8 +29,9 @@ from srfcli.diagnosis.search import Fitted, ModelSearch
 from srfcli.laws.registry import bundled_registry
 
 MOVES = (
-    "_expand", "_fit_at_the_file", "_with_own_noise", "_try_ageing_laws", "_expand_without_field", "_refit_noise", "_try_rivals",
-    "_in_all_runs", "_in_one_run", "_eliminate", "_refit_elsewhere", "_fit_all",
+    "_expand", "_fit_at_the_file", "_with_own_noise", "_try_ageing_laws", "_try_laws", "_try_laws_like",
+    "_expand_without_field", "_refit_noise", "_try_rivals", "_in_all_runs", "_in_one_run", "_eliminate", "_refit_elsewhere",
+    "_fit_all",
 )  # fmt: skip
 
 
@@ -79,7 +80,7 @@ def recorded(name: str) -> Any:
             return own(self, *arguments, **options)
         finally:
             self.stack.pop()
-            self.made |= {number: name for number in range(before + 1, self.count + 1) if number not in self.made}
+            self.made |= dict.fromkeys(range(before + 1, self.count + 1), name)
             self.cost[name] += time.process_time() - begun
 
     return method

@@ -50,6 +50,7 @@ from srfcli.inference.state_space import (
     maximise,
     processes_in,
     scan_narrow,
+    starts_elsewhere,
     thinned,
     wide_starts,
     with_less_colour,
@@ -331,7 +332,7 @@ class ModelSearch:
                 self._fit_at_the_file()
             base = self._expand(base)
             if not base.passes:
-                self._try_ageing_laws(base)
+                self._take(self._try_laws, base)
             self._ask(self._steps)
         if self.best().passes:
             self._ask(self._simplifying)
@@ -350,21 +351,23 @@ class ModelSearch:
             step, node = next(((s, f) for s, f in steps() if (s, f.name) not in self._taken), (None, None))
             if step is None or node is None:
                 return
-            step(node)
-            self._taken.add((step, node.name))
+            self._take(step, node)
+
+    def _take(self, step: Callable[[Fitted], Any], node: Fitted) -> None:
+        step(node)
+        self._taken.add((step, node.name))
 
     def _steps(self) -> list[_Step]:
         """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
         best, base = self.best(), self.baseline
-        steps: list[_Step] = []
-        if not best.passes:
-            steps += [(self._refit_elsewhere, best), (self._expand_without_field, base), (self._expand_without_field, best)]
-            steps += [(self._with_own_noise, best), (self._refit_noise, best)]
-        elif best.name == base.name:
-            steps.append((self._expand_without_field, base))
-        steps.append((self._try_laws_from_the_file, base))
+        mending: list[_Step] = [(self._with_own_noise, best), (self._refit_noise, best)]
+        steps: list[_Step] = [(self._try_laws, base if best.passes else best)]
         if best.hypothesis.ageing:
             steps.append((self._try_laws_like, best))
+        if not best.passes:
+            steps = [(self._refit_elsewhere, best), *steps, *((self._expand_without_field, f) for f in (base, best)), *mending]
+        elif best.name == base.name:
+            steps.append((self._expand_without_field, base))
         return [*steps, (self._try_rivals, best), *self._simplifying()]
 
     def _simplifying(self) -> list[_Step]:
@@ -372,8 +375,9 @@ class ModelSearch:
         return [(step, self.best()) for step in (self._in_all_runs, self._in_one_run, self._eliminate)]
 
     def _fit_all(self) -> None:
-        """Fit the baseline, and what comes close to the best, to all readings; the others were not."""
-        close = [f for f in self.ranked() if self.best().evidence - f.evidence < CLOSE][:MOST_FOLLOWED]
+        """Fit the baseline, the best and what passes and comes close to it to all readings; the others were not."""
+        best = self.best()
+        close = [f for f in self.ranked() if f is best or (f.passes and best.evidence - f.evidence < CLOSE)][:MOST_FOLLOWED]
         parts = {f.name: f for f in (*close, self.baseline)}
         self.experiment, fitted = self.whole, {}
         options = {"processes": None, "cautious": True, **self.options}
@@ -715,9 +719,9 @@ class ModelSearch:
         begun = neutral_values(score.effect).get(first, fitted.get("K", self.experiment.stiffness))
         return {**score.values, first: begun + ratio * score.size}
 
-    def _try_laws_from_the_file(self, node: Fitted) -> None:
+    def _try_laws(self, node: Fitted) -> None:
         """Push the other ageing laws, the file's own values tried, too: an effect, or the field, may pass for another law."""
-        self._try_ageing_laws(node, afresh=True)
+        self._try_ageing_laws(self.baseline, afresh=True)
 
     def _try_laws_like(self, best: Fitted) -> None:
         """Push the other ageing laws from where the best model, one of them, stands: another may be much like it."""
@@ -751,7 +755,7 @@ class ModelSearch:
                 start = self._at_the_file(likelihood, hypothesis, best.fit.values)
                 places.append(maximise(likelihood, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress))
             self._tried[name] = x
-            found = max(places, key=lambda m: m.promised, default=None)
+            found = max(places, key=lambda m: m.point.log_likelihood, default=None)  # far from a maximum a promise says nothing
             if found is not None and found.promised > least:
                 reached.append((found.promised, hypothesis, likelihood, found))
         reached.sort(key=lambda r: -r[0])
@@ -764,10 +768,13 @@ class ModelSearch:
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
 
     def _at_the_file(self, likelihood: Likelihood, hypothesis: Hypothesis, values: Mapping[str, float]) -> Array:
-        """Return the file's own start values under the gauge noise of `values` and the likeliest of a few wide fields."""
+        """Return the file's own start values under the gauge noise of `values` and the likeliest of a few wide fields.
+
+        Or, as in the fit of a baseline, the likeliest of others where the model cannot be followed from those.
+        """
         own = likelihood.beside(self._problem(hypothesis, {}))
         noise = {n: v for n, v in values.items() if n not in own.problem.names and n not in FIELD}
-        return next(iter(wide_starts(own, noise, self.progress)), own.coordinates(noise))
+        return (wide_starts(own, noise, self.progress) or starts_elsewhere(own, own.coordinates(noise), self.progress))[0]
 
     def _in_all_runs(self, best: Fitted) -> None:
         """Fit the best model with its effects in all runs: the score of one run may have been misled by what was missing then."""

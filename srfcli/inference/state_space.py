@@ -1241,7 +1241,7 @@ def _fitted(
 
     found = from_any(wide_starts(wide, start, progress))
     if found is None or (fresh and found.status is Status.INTEGRATION):
-        found = from_any(_elsewhere(wide, wide.coordinates(start), progress))
+        found = from_any(starts_elsewhere(wide, wide.coordinates(start), progress))
     assert found is not None
     if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
         found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
@@ -1800,7 +1800,7 @@ def _under_less(rough: Likelihood, found: Maximum, start: Mapping[str, float], p
     return other if other.point.log_likelihood > found.point.log_likelihood + NEEDED else found
 
 
-def _elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
+def starts_elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
     """Return SOBOL_STARTS starts over the bounds, mu0 that of the recordings, under wide fields in turn, the likeliest first.
 
     A model that slips without end at the file's start values, as one without inertia may, is followed from others.
