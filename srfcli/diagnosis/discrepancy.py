@@ -26,7 +26,7 @@ from srfcli.codegen.model import Array
 from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base
 from srfcli.diagnosis.hypotheses import own_parameters
-from srfcli.diagnosis.search import CLOSE, Fitted, ModelSearch
+from srfcli.diagnosis.search import BUDGET, CLOSE, Fitted, ModelSearch
 from srfcli.diagnosis.verdict import Diagnosis, Held, at_bounds, held_out, refusal
 from srfcli.inference.fit import root
 from srfcli.inference.recordings import slip_along
@@ -154,6 +154,7 @@ def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
     registry = with_terms(search.registry)
     names = {e.name for e in registry.entries("effect") if e.origin == ORIGIN}
     own = ModelSearch(registry, search.experiment, search.progress, sorted(names), search.trend)
+    own.budget = BUDGET / 2
     start = [diagnosis.baseline]
     if diagnosis.best is not diagnosis.baseline and not diagnosis.best.passes:
         start.append(diagnosis.best)

@@ -64,7 +64,7 @@ MOST_EFFECTS = 2  # effects of a model
 MOST_FOLLOWED = 5  # promises of each model that are followed
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 SEARCH_RTOL = 1e-3  # tolerance of the integration: 0.02 in log likelihood
-BUDGET = 150.0  # s of CPU, or more
+BUDGET = 300.0  # s of CPU, or more
 BASELINES = 5.0  # times what the baseline took, if that is more: two effects, each fitted twice, and what they leave to be scored
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 BUILT, BUILT_SPAN = 16, 1e3  # sizes of what is built in, a mass or an interface, that are tried; the largest over the least
@@ -332,7 +332,7 @@ class ModelSearch:
                 self._fit_at_the_file()
             base = self._expand(base)
             if not base.passes:
-                self._take(self._try_laws, base)
+                self._try_ageing_laws(base)
             self._ask(self._steps)
         if self.best().passes:
             self._ask(self._simplifying)
@@ -351,17 +351,14 @@ class ModelSearch:
             step, node = next(((s, f) for s, f in steps() if (s, f.name) not in self._taken), (None, None))
             if step is None or node is None:
                 return
-            self._take(step, node)
-
-    def _take(self, step: Callable[[Fitted], Any], node: Fitted) -> None:
-        step(node)
-        self._taken.add((step, node.name))
+            step(node)
+            self._taken.add((step, node.name))
 
     def _steps(self) -> list[_Step]:
         """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
         best, base = self.best(), self.baseline
         mending: list[_Step] = [(self._with_own_noise, best), (self._refit_noise, best)]
-        steps: list[_Step] = [(self._try_laws, base if best.passes else best)]
+        steps: list[_Step] = [(self._try_laws, base)]
         if best.hypothesis.ageing:
             steps.append((self._try_laws_like, best))
         if not best.passes:
