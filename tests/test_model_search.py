@@ -132,6 +132,25 @@ def test_a_search_without_budget_ends_at_the_baseline_and_says_so(ageing, monkey
     assert any("the search ended at its budget" in reason for reason in found.reasons)
 
 
+def test_a_fit_that_the_budget_ended_is_one_that_was_left(ageing):
+    """The baseline passes, and the first other model was being fitted: nothing is said to be missing, nor that nothing is."""
+
+    class Ended(ModelSearch):
+        others = 0
+
+        @property
+        def spent(self):
+            return self.others > 0
+
+        def fit(self, move):
+            self.others += move is not None
+            return super().fit(move)
+
+    search = Ended(SHIPPED, read_experiment(ageing, registry=SHIPPED, holdout=False), effects=FEW)
+    assert search.run() is search.baseline and search.cut_short and [*search.fitted] == ["none"]
+    assert conclude(search, read_experiment(ageing, registry=SHIPPED)).verdict == "inconclusive"
+
+
 @pytest.mark.slow
 def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(ageing, monkeypatch):
     """A search that takes every third reading says what one of all does; its fits are to all, at the same maximum."""

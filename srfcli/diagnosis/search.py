@@ -184,11 +184,12 @@ class ModelSearch:
 
     @contextlib.contextmanager
     def within_budget(self) -> Iterator[None]:
-        """Do what follows until it is done or the budget is spent: what was fitted until then is kept."""
+        """Do what follows until it is done or the budget is spent, as `cut_short` then says; what was fitted is kept."""
         self.bounded = True
         try:
-            with contextlib.suppress(_Spent):
-                yield
+            yield
+        except _Spent:
+            self.cut_short = True
         finally:
             self.bounded = False
 
@@ -339,7 +340,7 @@ class ModelSearch:
         if self.baseline.scores is None:  # from the best model's parameters it came to another maximum
             self._expand(self.baseline)
         best = self.best()
-        self.cut_short = self.spent and (not best.passes or self._promising(best) or self._expandable(best))
+        self.cut_short |= self.spent and (not best.passes or self._promising(best) or self._expandable(best))
         if self.experiment.runs is not self.whole.runs:
             self._fit_all()
         return self.best()
@@ -434,6 +435,9 @@ class ModelSearch:
             self.progress(f"{name}: expected log evidence {-move.expected:.1f}, best {best.evidence:.1f}")
             try:
                 found = self._record(self.fit(move))
+            except _Spent:
+                heapq.heappush(self.queue, move)
+                raise
             except SrfError as error:
                 self.excluded.append(Excluded(name, error.message))
                 self._expect_elsewhere(move)
