@@ -11,6 +11,8 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
+from srfcli.codegen.model import open_model
+from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis.discrepancy import (
     TERMS_FOLDER,
@@ -213,3 +215,10 @@ def test_a_form_that_cannot_be_fitted_beside_an_effect_is_tried_without_it(tmp_p
     search, diagnosis = searched(recorded(tmp_path, replace(Physics(), p_age=1.7)))
     found = best_form(search, diagnosis)
     assert found is not None and [t.effect.name for t in found.terms] == ["age-power"] and not found.beside
+
+
+def test_terms_whose_steady_age_is_a_quartic_s_root_cannot_be_joined():
+    """The quadratic ageing law with a term in the root of the age: its roots have cases, which generated code cannot tell."""
+    system = {"law": "dieterich-ruina", "ageing": "perrin-rice-zheng", "interface": "rigid", "inertia": False}
+    with pytest.raises(SrfError, match="no closed form for the steady state"):
+        open_model(with_terms(SHIPPED), **system, effects=("age-root",), random_field=True)

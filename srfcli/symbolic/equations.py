@@ -195,9 +195,10 @@ def _attracts(reduced: sp.Expr, y: sp.Symbol, root: sp.Expr, values: Mapping[sp.
 def _may_be_solved(reduced: sp.Expr, y: sp.Symbol) -> bool:
     """Return whether reduced = 0 may have a closed form in y; sympy takes many seconds to find that it has none.
 
-    A sum of terms c y^p (ln y)^q may have one if there are two at most, if all p are numbers and there is no logarithm, if all
-    p are alike, or if there are three that are a quadratic in a power of y or hold one logarithm, for a Lambert function. Of a
-    sum with any other terms it is not known.
+    A sum of terms c y^p (ln y)^q may have one if there are two at most, if all p are alike, if all p are numbers and, without a
+    logarithm, it is a cubic at most in a power of y or has no other symbol, or if there are three that are a quadratic in a power
+    of y or hold one logarithm, for a Lambert function. Of a sum with any other terms it is not known. The roots of a quartic take
+    sympy minutes, and have cases that generated code cannot tell apart.
     """
     powers: set[tuple[sp.Expr, sp.Expr]] = set()
     for term in sp.Add.make_args(sp.expand(reduced.as_independent(y, as_Add=False)[1])):
@@ -212,7 +213,12 @@ def _may_be_solved(reduced: sp.Expr, y: sp.Symbol) -> bool:
                 return True
         powers.add((p, q))
     exponents, logarithms = [p for p, _ in powers], sum(q != 0 for _, q in powers)
-    if len(powers) < 3 or len(set(exponents)) == 1 or (not logarithms and all(p.is_number for p in exponents)):
+    if len(powers) < 3 or len(set(exponents)) == 1:
+        return True
+    if not logarithms and all(p.is_Rational for p in exponents):
+        apart = [p - min(exponents) for p in exponents]
+        return max(apart) <= 3 * sp.gcd_list(apart) or reduced.free_symbols == {y}
+    if not logarithms and all(p.is_number for p in exponents):
         return True
     quadratic = not logarithms and any(sp.expand(sp.Add(*exponents) - 3 * middle) == 0 for middle in exponents)
     return len(powers) == 3 and (quadratic or logarithms == 1)
