@@ -169,7 +169,7 @@ class ModelSearch:
         self.on_request = [e.name for e in every if effects is None and e.on_request]
         self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]
         self.budget, self.begun, self.cut_short = BUDGET, time.process_time(), False
-        self.bounded = False  # whether what is done now ends with the budget
+        self._bounded = False  # whether what is done now ends with the budget
         self.fitted: dict[str, Fitted] = {}
         self.queue: list[_Move] = []
         self.count = 0
@@ -179,19 +179,19 @@ class ModelSearch:
     def progress(self, text: str) -> None:
         """Tell what is done; where the budget is spent, end what is bounded by it."""
         self._told(text)
-        if self.bounded and self.spent:
+        if self._bounded and self.spent:
             raise _Spent
 
     @contextlib.contextmanager
     def within_budget(self) -> Iterator[None]:
         """Do what follows until it is done or the budget is spent, as `cut_short` then says; what was fitted is kept."""
-        self.bounded = True
+        self._bounded = True
         try:
             yield
         except _Spent:
             self.cut_short = True
         finally:
-            self.bounded = False
+            self._bounded = False
 
     # ------------------------------------------------------------------ models and their fits
 
@@ -333,7 +333,7 @@ class ModelSearch:
                 self._fit_at_the_file()
             base = self._expand(base)
             if not base.passes:
-                self._try_ageing_laws(base)
+                self._try_ageing_laws(self.best())
             self._ask(self._steps)
         if self.best().passes:
             self._ask(self._simplifying)
@@ -359,9 +359,9 @@ class ModelSearch:
         """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
         best, base = self.best(), self.baseline
         mending: list[_Step] = [(self._with_own_noise, best), (self._refit_noise, best)]
-        steps: list[_Step] = [(self._try_laws, base)]
+        steps: list[_Step] = [(self._try_laws_afresh, base)]
         if best.hypothesis.ageing:
-            steps.append((self._try_laws_like, best))
+            steps.append((self._try_ageing_laws, best))
         if not best.passes:
             steps = [(self._refit_elsewhere, best), *steps, *((self._expand_without_field, f) for f in (base, best)), *mending]
         elif best.name == base.name:
@@ -465,16 +465,20 @@ class ModelSearch:
 
     def _expand(self, node: Fitted) -> Fitted:
         """Push what a fitted model promises: one more effect, two at once, something built in, another ageing law."""
-        present, joining = node.hypothesis.effects, self._joining(node)
         self.progress(f"{node.name}: scores")
-        scores = Scores(self.registry, node.fit.likelihood.problem.experiment, node.remainder, present, joining)
+        scores = self._scores(node)
         self.excluded += scores.excluded
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
         random = not node.fit.smooth or node.fit.likelihood.processes  # may have taken up what is missing
         self._push(self._promised(node, node, self._gains(scores), WORTH if node.passes and not random else CLOSE))
-        self._push([m for e in joining if (e.settings or e.observed) and (m := self._built_in(node, e))])
+        self._push([m for e in self._joining(node) if (e.settings or e.observed) and (m := self._built_in(node, e))])
         return node
+
+    def _scores(self, node: Fitted) -> Scores:
+        """Return the scores of the effects that a fitted model lacks."""
+        experiment = node.fit.likelihood.problem.experiment
+        return Scores(self.registry, experiment, node.remainder, node.hypothesis.effects, self._joining(node))
 
     def _joining(self, node: Fitted) -> list[Effect]:
         """Return the effects that a fitted model lacks and could have."""
@@ -518,14 +522,13 @@ class ModelSearch:
         """
         if len(node.hypothesis.effects) == MOST_EFFECTS or not taken_up(node.fit):
             return
-        problem = node.fit.likelihood.problem
-        bare = Likelihood(problem, smooth=True, rtol=SEARCH_RTOL)
+        bare = Likelihood(node.fit.likelihood.problem, smooth=True, rtol=SEARCH_RTOL)
         found = maximise(bare, bare.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
         if found.status is Status.INTEGRATION:  # without a field nothing follows the recordings
             return
         plain = self._passed(node.hypothesis, StateSpaceFit(bare, found))
         self.progress(f"{node.name}: scores without field and colour")
-        scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, self._joining(node))
+        scores = self._scores(plain)
         for promised in ([(s.gain, s) for s in scores.every], [(s.gain - self._rarer, s) for s in scores.alone]):
             self._push(self._promised(node, plain, promised, WORTH, noise=False))  # as many in one run alone as in all
 
@@ -587,9 +590,8 @@ class ModelSearch:
         self.progress("scores at the start values")
         found = StateSpaceFit(likelihood, maximise(likelihood, x, steps=0, widths=()))
         node = self._passed(Hypothesis(), found)
-        scores = Scores(self.registry, likelihood.problem.experiment, node.remainder, (), self._joining(node))
         wide = {n: found.values[n] for n in FIELD}
-        for move in self._promised(node, node, self._gains(scores), WORTH, noise=False)[:1]:
+        for move in self._promised(node, node, self._gains(self._scores(node)), WORTH, noise=False)[:1]:
             with contextlib.suppress(SrfError):  # it cannot be followed from there
                 self._record(self.fit(replace(move, values=move.values | wide)))
 
@@ -720,21 +722,17 @@ class ModelSearch:
         begun = neutral_values(score.effect).get(first, fitted.get("K", self.experiment.stiffness))
         return {**score.values, first: begun + ratio * score.size}
 
-    def _try_laws(self, node: Fitted) -> None:
+    def _try_laws_afresh(self, base: Fitted) -> None:
         """Push the other ageing laws, the file's own values tried, too: an effect, or the field, may pass for another law."""
-        self._try_ageing_laws(self.baseline, afresh=True)
+        self._try_ageing_laws(self.best(), afresh=True)
 
-    def _try_laws_like(self, best: Fitted) -> None:
-        """Push the other ageing laws from where the best model, one of them, stands: another may be much like it."""
-        self._try_ageing_laws(self.baseline)
-
-    def _try_ageing_laws(self, node: Fitted, *, afresh: bool = False) -> None:
-        """Push the other ageing laws, each after a few steps from where the model or the best one stands.
+    def _try_ageing_laws(self, best: Fitted, *, afresh: bool = False) -> None:
+        """Push the other ageing laws, each after a few steps from where the baseline or the best model stands.
 
         `afresh` also from the file's own values: a fit that has made up for a wrong law may stand where no step leads to the
         right one. The law that promises most goes on from there: the right one lies further off than a step tells.
         """
-        best = self.best()
+        node = self.baseline
         parents = (node,) if best is node else (node, best)
         stated, *modifiers = self.experiment.choice.ageing.split("+")
         least = node.fit.log_likelihood + (WORTH if node.passes else -HOPELESS)  # log likelihood
