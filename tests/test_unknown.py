@@ -64,7 +64,7 @@ def bump(tmp_path_factory):
     """Diagnosis and explanation of a bump of 0.004 on 14 um of the track."""
     p = replace(Physics(), bump=0.004, bump_x=14.0, bump_w=1.2)
     search, diagnosis = searched(recorded(tmp_path_factory.mktemp("bump"), p))
-    return diagnosis, explain_unknown(search, diagnosis)
+    return diagnosis, explain_unknown(diagnosis, best_form(search, diagnosis))
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +170,25 @@ def test_the_form_is_offered_as_an_effect(age):
     (term,) = json.loads((age / "answer.json").read_text())["missing"]["terms"]
     assert effect.parameters[0].default == pytest.approx(term["parameters"]["age_power"]["value"])
     assert formula_text(effect.changes[0][1]) == formula_text(read_law(TERMS_FOLDER / "age-power.toml").changes[0][1])
+
+
+@pytest.mark.parametrize(
+    ("end", "code", "said"), [(KeyboardInterrupt, 130, "did not end"), (RuntimeError, 0, "RuntimeError: no")]
+)
+def test_a_verdict_outlives_its_explanation(age, tmp_path, monkeypatch, without_figures, end, code, said):
+    """Where the search for a closed form is interrupted, or fails, verdict and missing force are written all the same."""
+
+    def ends(search, diagnosis):
+        raise end("no")
+
+    monkeypatch.setattr("srfcli.tasks.diagnose.best_form", ends)
+    out = tmp_path / "found"
+    result = CliRunner().invoke(cli, ["diagnose", str(age.parent), "--effect", "sensor-lag", "--out", str(out)])
+    assert result.exit_code == code, result.output
+    assert "unknown" in result.output and said in " ".join(result.output.split())
+    found = json.loads((out / "answer.json").read_text())
+    assert found["verdict"] == "unknown" and not found["missing"]["searched"] and found["missing"]["form"] is None
+    assert (out / "missing-steps.csv").exists()
 
 
 def test_terms_together_are_one_effect(tmp_path):

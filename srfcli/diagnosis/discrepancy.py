@@ -12,7 +12,7 @@ Fixed-interval smoother: de Jong, Biometrika 76 (1989).
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import floor, isfinite, log10
@@ -183,21 +183,16 @@ def _fitted(effect: Effect, fitted: Fitted) -> FittedTerm:
     return FittedTerm(effect, values)
 
 
-def explain_unknown(search: ModelSearch, diagnosis: Diagnosis, *, stopped: Callable[[], None] = lambda: None) -> dict[str, Any]:
+def explain_unknown(diagnosis: Diagnosis, form: ClosedForm | None, *, searched: bool = True) -> dict[str, Any]:
     """Return what there is to say where no registered effect explains a recording, as plain data and arrays.
 
     `force` holds, by run, the arrays of `RunForce.described`, and `form`, `unit`; `latent` is how that force was estimated.
     `form`, `gain`, `held_gain`, `terms` and the rest of `ClosedForm.described` are of the closed form, `form` None where no term
-    helps; `toml` is that form as an effect file. Interrupted, the closed form is left out, and `stopped` is called.
+    helps, or where the search for it did not end, `searched`; `toml` is that form as an effect file.
     """
     baseline = diagnosis.baseline
     force = unexplained_friction(baseline)
-    found: dict[str, Any] = {"form": None, "gain": None, "held_gain": None, "terms": [], "toml": None}
-    try:
-        form = best_form(search, diagnosis)
-    except KeyboardInterrupt:
-        form = None
-        stopped()
+    found: dict[str, Any] = {"form": None, "searched": searched, "gain": None, "held_gain": None, "terms": [], "toml": None}
     if form is not None:
         found |= {**form.described(), "toml": form.as_toml()}
     values = baseline.fit.values

@@ -367,6 +367,8 @@ def _missing(missing: dict[str, Any]) -> list[str]:
     notes = [f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"]
     for name, share in list(latent["coordinates"].items())[:1]:
         notes[0] += f"; a function of {name} is {100 * share:.0f} % of it"
+    if missing["form"] is None and not missing["searched"]:
+        return [*notes, "the search for a closed form did not end"]
     if missing["form"] is None:
         return [*notes, "no closed form over the candidate terms is worth its parameters"]
     gain, held = missing["gain"], missing["held_gain"]

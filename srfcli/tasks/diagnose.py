@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from srfcli.codegen.c_source import GET_COMPILER, compiler
@@ -12,7 +13,7 @@ from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import BY, grouped
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.design import discriminating_run
-from srfcli.diagnosis.discrepancy import explain_unknown
+from srfcli.diagnosis.discrepancy import best_form, explain_unknown
 from srfcli.diagnosis.residual_scan import locate
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import conclude
@@ -133,18 +134,24 @@ def diagnose(
     told("location")
     last = diagnosis.final if diagnosis.final is not diagnosis.baseline and diagnosis.final.passes else None
     location = locate(diagnosis.baseline, last=last, seed=seed)
-    missing, discriminating = {}, None
-    if not stopped and not fitted.thresholds and diagnosis.verdict == "unknown":
-
-        def interrupted() -> None:
-            nonlocal stopped
-            stopped = True
-
-        told("unknown: what is missing")
-        missing = explain_unknown(search, diagnosis, stopped=interrupted)
-    if not stopped and not fitted.thresholds and diagnosis.verdict == "ambiguous":
-        told("ambiguous: the run that would tell them apart")
-        discriminating = discriminating_run(registry, diagnosis, seed=seed)
+    form, missing, discriminating, ended = None, {}, None, False
+    verdict = "" if stopped or fitted.thresholds else diagnosis.verdict
+    try:
+        if verdict == "unknown":
+            told("unknown: what is missing")
+            form = best_form(search, diagnosis)
+        elif verdict == "ambiguous":
+            told("ambiguous: the run that would tell them apart")
+            discriminating = discriminating_run(registry, diagnosis, seed=seed)
+        ended = True
+    except KeyboardInterrupt:
+        stopped = True
+    except Exception as error:  # the verdict is not to be lost for what follows from it
+        sought = "closed form of what is missing" if verdict == "unknown" else "run that would tell them apart"
+        said = f"the search for a {sought} ended in an error: {type(error).__name__}: {error}"
+        diagnosis = replace(diagnosis, reasons=(*diagnosis.reasons, said))
+    if verdict == "unknown":
+        missing = explain_unknown(diagnosis, form, searched=ended)
     return DiagnosisResult(
         diagnosis, location, registry, missing, discriminating, stopped, reader, seed, time.perf_counter() - begun
     )
