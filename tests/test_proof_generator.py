@@ -387,6 +387,16 @@ def test_slip_that_nothing_ends_is_no_case():
     assert trace.complete and trace.u.min() > 0
 
 
+def test_slip_that_a_solver_stepped_over_is_no_case():
+    """Without inertia slip after a hold becomes infinitely fast in the end, and the spring would still pull beyond."""
+    rock = Physics(K=0.0191, M=0.0, mu0=0.651, A=0.007226, B=0.010457, D0=31.8, rigid=True, massless=True, bare=True)
+    p = replace(rock, ageing="perrin-rice-zheng")
+    plan = Plan("holds", ((5.5, 29.2), (94.8, 0.0), (5.5, 29.2)), 19.7, 0.07)
+    trace = move(p, plan)
+    reached = trace.t[np.isfinite(trace.u)][-1]
+    assert not trace.complete and 100.3 < reached < 105.8
+
+
 def test_terms_add_up():
     terms = at_unit_velocity(Physics(C=1e-3, topo=1e-3, topo_L=8.0), 100.0)
     m, a = terms(0.0, 4.0, np.log(0.0402), 0.0, 7.0)
