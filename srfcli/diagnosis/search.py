@@ -332,7 +332,9 @@ class ModelSearch:
             if taken_up(base.fit):
                 self._fit_at_the_file()
             base = self._expand(base)
-            if not base.passes:
+            if taken_up(base.fit):  # else what the baseline comes to is where another law stands, too
+                self._take(self._try_laws_afresh, base)
+            elif not base.passes:
                 self._try_ageing_laws(self.best())
             self._ask(self._steps)
         if self.best().passes:
@@ -352,8 +354,11 @@ class ModelSearch:
             step, node = next(((s, f) for s, f in steps() if (s, f.name) not in self._taken), (None, None))
             if step is None or node is None:
                 return
-            step(node)
-            self._taken.add((step, node.name))
+            self._take(step, node)
+
+    def _take(self, step: Callable[[Fitted], Any], node: Fitted) -> None:
+        step(node)
+        self._taken.add((step, node.name))
 
     def _steps(self) -> list[_Step]:
         """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
@@ -363,14 +368,21 @@ class ModelSearch:
         if best.hypothesis.ageing:
             steps.append((self._try_ageing_laws, best))
         if not best.passes:
-            steps = [(self._refit_elsewhere, best), *steps, *((self._expand_without_field, f) for f in (base, best)), *mending]
-        elif best.name == base.name:
+            steps = [*((self._refit_elsewhere, f) for f in (self._simplest(), best)), *steps]
+            steps += [*((self._expand_without_field, f) for f in (base, best)), *mending, (self._fit_what_waits, best)]
+        else:
             steps.append((self._expand_without_field, base))
         return [*steps, (self._try_rivals, best), *self._simplifying()]
 
     def _simplifying(self) -> list[_Step]:
         """Return the steps that lead from the model that is the best now to others that are as simple, or simpler."""
-        return [(step, self.best()) for step in (self._in_all_runs, self._in_one_run, self._eliminate)]
+        simplest, steps = self._simplest(), (self._in_all_runs, self._in_one_run, self._eliminate)
+        return [*([] if simplest.passes else [(self._refit_elsewhere, simplest)]), *((step, self.best()) for step in steps)]
+
+    def _simplest(self) -> Fitted:
+        """Return the simplest of the models that come close to the best: the best's other parts may make up for its maximum."""
+        close = [f for f in self.ranked() if f.evidence > self.best().evidence - CLOSE]
+        return min(close, key=lambda f: len(f.hypothesis.reported))
 
     def _fit_all(self) -> None:
         """Fit the baseline, the best and what passes and comes close to it to all readings; the others were not."""
@@ -428,21 +440,32 @@ class ModelSearch:
                     break
                 self._expand(best)
                 continue
-            move = heapq.heappop(self.queue)
-            name = move.hypothesis.name
-            if name in self.fitted and self.fitted[name].evidence > -move.expected - WORTH:
-                continue
-            self.progress(f"{name}: expected log evidence {-move.expected:.1f}, best {best.evidence:.1f}")
-            try:
-                found = self._record(self.fit(move))
-            except _Spent:
-                heapq.heappush(self.queue, move)
-                raise
-            except SrfError as error:
-                self.excluded.append(Excluded(name, error.message))
-                self._expect_elsewhere(move)
-                continue
-            self._revise(move, found)
+            self._fit_next(heapq.heappop(self.queue))
+
+    def _fit_next(self, move: _Move) -> None:
+        """Fit a model that waited; what cannot be fitted is left out, with the reason."""
+        name = move.hypothesis.name
+        if name in self.fitted and self.fitted[name].evidence > -move.expected - WORTH:
+            return
+        self.progress(f"{name}: expected log evidence {-move.expected:.1f}, best {self.best().evidence:.1f}")
+        try:
+            found = self._record(self.fit(move))
+        except _Spent:
+            heapq.heappush(self.queue, move)
+            raise
+        except SrfError as error:
+            self.excluded.append(Excluded(name, error.message))
+            self._expect_elsewhere(move)
+            return
+        self._revise(move, found)
+
+    def _fit_what_waits(self, best: Fitted) -> None:
+        """Fit what waits, the simplest first, until one is the best: a model that fails a test is no measure of promises."""
+        while self.queue and not self.spent and self.best().name == best.name:
+            move = min(self.queue, key=lambda m: (len(m.hypothesis.reported), m.expected))
+            self.queue.remove(move)
+            heapq.heapify(self.queue)
+            self._fit_next(move)
 
     def _revise(self, move: _Move, found: Fitted) -> None:
         """Raise what is expected of effects that are like a fitted one at first order by what that gained beyond its promise."""
@@ -518,9 +541,12 @@ class ModelSearch:
     def _expand_without_field(self, node: Fitted) -> None:
         """Push what effects promise from a fit without field and colour, where these have taken up what the model lacks.
 
-        Under a field that no track has, the scores of what is missing are as low as those of what is not.
+        Under a field that no track has, the scores of what is missing are as low as those of what is not. Beside a best model
+        that passes, only what promises more than an effect of that.
         """
-        if len(node.hypothesis.effects) == MOST_EFFECTS or not taken_up(node.fit):
+        best = self.best()
+        passed = best.hypothesis.effects if best.passes and best.name != node.name else None
+        if len(node.hypothesis.effects) == MOST_EFFECTS or passed == () or not taken_up(node.fit):
             return
         bare = Likelihood(node.fit.likelihood.problem, smooth=True, rtol=SEARCH_RTOL)
         found = maximise(bare, bare.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
@@ -529,8 +555,16 @@ class ModelSearch:
         plain = self._passed(node.hypothesis, StateSpaceFit(bare, found))
         self.progress(f"{node.name}: scores without field and colour")
         scores = self._scores(plain)
-        for promised in ([(s.gain, s) for s in scores.every], [(s.gain - self._rarer, s) for s in scores.alone]):
-            self._push(self._promised(node, plain, promised, WORTH, noise=False))  # as many in one run alone as in all
+        named = {(e.reported, e.run) for e in passed or ()}
+        gains: dict[bool, list[tuple[float, Score]]] = {False: [], True: []}  # in all runs, in one alone
+        least = WORTH
+        for gain, score in self._gains(scores):
+            if (score.effect.reported, score.effect.run) in named:
+                least = max(least, gain)
+            else:
+                gains[bool(score.effect.run)].append((gain, score))
+        for promised in gains.values():  # as many in one run alone as in all
+            self._push(self._promised(node, plain, promised, least, noise=False))
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""
@@ -747,33 +781,40 @@ class ModelSearch:
             starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in parents]
             heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts] if len(starts) > 1 else [0.0]
             x = starts[int(np.argmax(heights))]
-            places = []
+            places: list[tuple[Likelihood, Maximum]] = []
             if not np.array_equal(x, self._tried.get(name, ())):  # else what came of it is in the queue
-                places.append(maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress))
+                near = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
+                places.append((likelihood, near))
             if afresh and self.experiment.runs:
-                start = self._at_the_file(likelihood, hypothesis, best.fit.values)
-                places.append(maximise(likelihood, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress))
+                places += self._from_the_file(likelihood, hypothesis, node)
             self._tried[name] = x
-            found = max(places, key=lambda m: m.point.log_likelihood, default=None)  # far from a maximum a promise says nothing
-            if found is not None and found.promised > least:
-                reached.append((found.promised, hypothesis, likelihood, found))
+            if places:  # far from a maximum a promise says nothing
+                likelihood, found = max(places, key=lambda p: p[1].point.log_likelihood)
+                if found.promised > least:
+                    reached.append((found.promised, hypothesis, likelihood, found))
         reached.sort(key=lambda r: -r[0])
         for number, (promise, hypothesis, likelihood, found) in enumerate(reached):
-            if number == 0 and found.away > NEAR:
+            if number == 0 and found.away > 1.0:
                 found = maximise(likelihood, found.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
                 promise = found.promised
             self.count += 1
             expected = promise - node.fit.log_likelihood + node.attainable
-            heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
+            bare = node.fit.likelihood.processes and not likelihood.processes  # its noise is to be estimated anew
+            values = {n: v for n, v in found.point.values.items() if not (bare and n.startswith("gauge_"))}
+            heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, values, ()))
 
-    def _at_the_file(self, likelihood: Likelihood, hypothesis: Hypothesis, values: Mapping[str, float]) -> Array:
-        """Return the file's own start values under the gauge noise of `values` and the likeliest of a few wide fields.
-
-        Or, as in the fit of a baseline, the likeliest of others where the model cannot be followed from those.
-        """
-        own = likelihood.beside(self._problem(hypothesis, {}))
-        noise = {n: v for n, v in values.items() if n not in own.problem.names and n not in FIELD}
-        return (wide_starts(own, noise, self.progress) or starts_elsewhere(own, own.coordinates(noise), self.progress))[0]
+    def _from_the_file(
+        self, likelihood: Likelihood, hypothesis: Hypothesis, node: Fitted
+    ) -> Iterator[tuple[Likelihood, Maximum]]:
+        """Return the maximum from the file's start values without colour, and where a model's coloured noise leads from it."""
+        own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
+        start = (wide_starts(own, {}, self.progress) or starts_elsewhere(own, own.coordinates({}), self.progress))[0]
+        found = maximise(own, start, close=1.0, progress=self.progress)
+        yield own, found
+        if likelihood.processes:
+            noise = {n: v for n, v in node.fit.values.items() if n.startswith("gauge_")}
+            x = likelihood.coordinates({**found.point.values, **noise})
+            yield likelihood, maximise(likelihood, x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
 
     def _in_all_runs(self, best: Fitted) -> None:
         """Fit the best model with its effects in all runs: the score of one run may have been misled by what was missing then."""

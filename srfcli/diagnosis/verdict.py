@@ -184,7 +184,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     return Diagnosis(
         whole, verdict, best, baseline, baseline if verdict in BASELINE_VERDICTS else shown, ranked, close,
         _confidence(ranked, joint, became, verdict), scores,
-        (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores},
+        tuple(dict.fromkeys((*search.excluded, *absorbed))), {s.effect.reported: s.detectable for s in scores},
         _equivalent(scores, close, ranked, joint), held,
         tuple(reasons), ungated, held_loads, became,
     )  # fmt: skip

@@ -1254,10 +1254,12 @@ def _fitted(
     if found.promised < least:
         found = maximise(wide, found.point.x, close=close, progress=progress) if np.isinf(found.away) else found
         best = StateSpaceFit(wide, found)
-        if found.promised < least:
+        if found.promised < least and processes is not None:
             return best
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
     best = first = _with_colour(best, likelihood, progress, cautious) if processes is None else best
+    if best.maximum.promised < least:
+        return best
     best = _with_or_without(best, smooth, likelihood, close, progress)
     if thorough and processes is None:
         moved = best.smooth or best.log_likelihood > first.log_likelihood + NEEDED
