@@ -187,7 +187,7 @@ def test_what_the_equations_cannot_follow_is_said(make_model, inertia):
     load = LoadSteps.sequence([(1, 9.0, 9.0), (4, 0.9, 0.9)], start=0.0, rise=0.01)
     found = moved(model, Drive.steps([(0, 8.0), (0.5, 20.0)]), load, t, W0=9.0)
     assert found.status is Status.INTEGRATION
-    assert 0.5 < found.reached < 1.1
+    assert 0.5 < found.reached < 1.1 and found.steps < 20_000  # it gives up soon
     assert np.isfinite(found.x[t <= found.reached - 0.01]).all() and np.isnan(found.x[t > found.reached]).all()
 
 

@@ -27,6 +27,7 @@ from srfcli.diagnosis.discrepancy import (
 )
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import Diagnosis, conclude
+from srfcli.inference.fit import Interrupted
 from srfcli.laws.effect_file import formula_text
 from srfcli.laws.registry import bundled_registry, read_law
 from srfcli.tasks.law_check import check_law
@@ -173,7 +174,8 @@ def test_the_form_is_offered_as_an_effect(age):
 
 
 @pytest.mark.parametrize(
-    ("end", "code", "said"), [(KeyboardInterrupt, 130, "did not end"), (RuntimeError, 0, "RuntimeError: no")]
+    ("end", "code", "said"),
+    [(KeyboardInterrupt, 130, "did not end"), (Interrupted, 130, "did not end"), (RuntimeError, 0, "RuntimeError: no")],
 )
 def test_a_verdict_outlives_its_explanation(age, tmp_path, monkeypatch, without_figures, end, code, said):
     """Where the search for a closed form is interrupted, or fails, verdict and missing force are written all the same."""

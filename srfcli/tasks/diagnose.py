@@ -144,7 +144,7 @@ def diagnose(
             told("ambiguous: the run that would tell them apart")
             discriminating = discriminating_run(registry, diagnosis, seed=seed)
         ended = True
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Interrupted):
         stopped = True
     except Exception as error:  # the verdict is not to be lost for what follows from it
         sought = "closed form of what is missing" if verdict == "unknown" else "run that would tell them apart"
