@@ -363,15 +363,13 @@ class ModelSearch:
     def _steps(self) -> list[_Step]:
         """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
         best, base = self.best(), self.baseline
-        mending: list[_Step] = [(self._with_own_noise, best), (self._refit_noise, best)]
-        steps: list[_Step] = [(self._try_laws_afresh, base)]
-        if best.hypothesis.ageing:
-            steps.append((self._try_ageing_laws, best))
-        if not best.passes:
-            steps = [*((self._refit_elsewhere, f) for f in (self._simplest(), best)), *steps]
-            steps += [*((self._expand_without_field, f) for f in (base, best)), *mending, (self._fit_what_waits, best)]
+        if best.passes:  # what another law could gain is near: nothing is left that a fit elsewhere would explain
+            steps: list[_Step] = [(self._try_ageing_laws, best), (self._expand_without_field, base)]
         else:
-            steps.append((self._expand_without_field, base))
+            steps = [*((self._refit_elsewhere, f) for f in (self._simplest(), best)), (self._try_laws_afresh, base)]
+            steps += [(self._try_ageing_laws, best)] if best.hypothesis.ageing else []
+            steps += [(self._expand_without_field, f) for f in (base, best)]
+            steps += [(self._with_own_noise, best), (self._refit_noise, best), (self._fit_what_waits, best)]
         return [*steps, (self._try_rivals, best), *self._simplifying()]
 
     def _simplifying(self) -> list[_Step]:
