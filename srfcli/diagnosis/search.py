@@ -363,7 +363,7 @@ class ModelSearch:
     def _steps(self) -> list[_Step]:
         """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
         best, base = self.best(), self.baseline
-        if best.passes:  # what another law could gain is near: nothing is left that a fit elsewhere would explain
+        if best.passes:  # other laws are tried near it alone: fits from the file's values take half of the time
             steps: list[_Step] = [(self._try_ageing_laws, best), (self._expand_without_field, base)]
         else:
             steps = [*((self._refit_elsewhere, f) for f in (self._simplest(), best)), (self._try_laws_afresh, base)]
