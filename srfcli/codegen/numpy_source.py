@@ -37,8 +37,8 @@ class Staged:
 
     def substituted(self, values: Mapping[sp.Expr, sp.Expr]) -> Staged:
         """Return the same with inputs replaced; the steps keep their names."""
-        steps = tuple((s, e.subs(values)) for s, e in self.steps)
-        return Staged(tuple(e.subs(values) for e in self.outputs), steps, self.names)
+        steps = tuple((s, e.xreplace(values)) for s, e in self.steps)
+        return Staged(tuple(e.xreplace(values) for e in self.outputs), steps, self.names)
 
     def with_outputs(self, outputs: Sequence[sp.Expr]) -> Staged:
         """Return other outputs of the same steps."""
@@ -104,6 +104,7 @@ class Writer:
         self.declared = system.parameters
         self.printer = NumPyText()
         self.parts: list[str] = []
+        self.texts: dict[sp.Expr, str] = {}
 
     @property
     def parameters(self) -> list[str]:
@@ -164,7 +165,9 @@ class Writer:
         self.function(name, doc, indexed, steps=formulas.steps, shape=f"({rows}, {columns})", **more)
 
     def text(self, expression: sp.Expr) -> str:
-        return self.printer.doprint(renamed(expression))
+        if expression not in self.texts:  # the functions of one module share most of their steps
+            self.texts[expression] = self.printer.doprint(renamed(expression))
+        return self.texts[expression]
 
     def _unpack(self, used: set[str], vectors: Sequence[str], state: bool) -> Iterable[str]:
         for i, name in enumerate(self.parameters):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -300,9 +300,16 @@ def _modulated(formula: sp.Expr, *, cyclic: bool) -> sp.Expr:
     """
     s, t = symbol, symbol("time")
     if cyclic:
-        return formula.subs(s("theta"), 2 * sp.pi * s("f") * t)
+        return formula.xreplace({s("theta"): 2 * sp.pi * s("f") * t})
     envelope = (1 + sp.tanh((t - s("onset0")) / s("rise0"))) / 2  # of its switch-on
-    return formula.subs({s("theta"): 2 * sp.pi * s("f") * t + s("psi"), s("envelope"): envelope})
+    return formula.xreplace({s("theta"): 2 * sp.pi * s("f") * t + s("psi"), s("envelope"): envelope})
+
+
+def _replaced(formula: sp.Expr, meaning: Sequence[tuple[sp.Symbol, sp.Expr]]) -> sp.Expr:
+    """Return a formula with each symbol replaced by its meaning, one after the other: `subs` takes ten times as long."""
+    for name, value in meaning:
+        formula = formula.xreplace({name: value})
+    return formula
 
 
 def auxiliary(system: System, parts: Parts, *, cyclic: bool = False) -> tuple[str, ...]:
@@ -377,13 +384,13 @@ class _Builder:
             rates.append(self.aux_rate(name))
             steady.append(self.settled(s(name), u_rest, mu_ss))
         meaning = [*([] if system.inertia else [(s("u"), spring)]), *meaning]  # it is made of what follows
-        filled = [_modulated(r.subs(meaning), cyclic=self.cyclic) for r in rates]
+        filled = [_modulated(_replaced(r, meaning), cyclic=self.cyclic) for r in rates]
         clock = {"time", "envelope"} if self.cyclic else set()
         self.check_known(filled, {*map(str, unknowns), "V", "W", "W_dot", *clock})
         self.check_known(steady, clock)
         reading, shown = self.parts.gauge, self.parts.plain
         if not system.inertia:
-            spring, reading, shown = (e.subs(meaning) for e in (spring, reading, shown))
+            spring, reading, shown = (_replaced(e, meaning) for e in (spring, reading, shown))
         self.check_known([reading, shown], {*map(str, unknowns), "W", *clock})
         return Equations(
             names=tuple(names),
