@@ -29,7 +29,7 @@ from srfcli.diagnosis.search import Fitted, ModelSearch
 from srfcli.laws.registry import bundled_registry
 
 MOVES = (
-    "_expand", "_fit_at_the_file", "_with_own_noise", "_try_ageing_laws", "_try_laws_afresh",
+    "_expand", "_with_own_noise", "_try_ageing_laws", "_try_laws_afresh",
     "_expand_without_field", "_refit_noise", "_try_rivals", "_in_all_runs", "_in_one_run", "_eliminate", "_refit_elsewhere",
     "_fit_what_waits", "_fit_all",
 )  # fmt: skip

@@ -105,6 +105,11 @@ class Fitted:
         """Return whether the model passes every test of what a fit leaves."""
         return not self.against
 
+    @property
+    def random(self) -> bool:
+        """Return whether the model has a random field or coloured noise, which may have taken up a part of what is missing."""
+        return not self.fit.smooth or bool(self.fit.likelihood.processes)
+
     def predictive(self, run: Run) -> Predictive:
         """Return how well a run that was not fitted is predicted, with priors as in the log evidence."""
         return self.fit.predictive(run, self.hypothesis.priors(self.fit.likelihood.problem.model))
@@ -326,14 +331,16 @@ class ModelSearch:
         come close is asked in turn what may have misled, and the search goes on with what that brings.
         """
         self.progress("baseline")
-        base = self._with_own_noise(self._record(self.fit(None)))
+        base = self._record(self.fit(None))
         self.budget = max(BUDGET, BASELINES * (time.process_time() - self.begun))
         with self.within_budget():
-            if taken_up(base.fit):
-                self._fit_at_the_file()
-            base = self._expand(base)
-            if taken_up(base.fit):  # else what the baseline comes to is where another law stands, too
-                self._take(self._try_laws_afresh, base)
+            base = self._expand(self._with_own_noise(base))
+            if taken_up(base.fit):  # field or noise make up for what is missing: without them it shows, or it is another law
+                self._take(self._expand_without_field, base)
+                if self.queue:
+                    self._fit_next(heapq.heappop(self.queue))
+                if not self.best().passes or self.best().random:
+                    self._take(self._try_laws_afresh, base)
             elif not base.passes:
                 self._try_ageing_laws(self.best())
             self._ask(self._steps)
@@ -491,8 +498,7 @@ class ModelSearch:
         self.excluded += scores.excluded
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
-        random = not node.fit.smooth or node.fit.likelihood.processes  # may have taken up what is missing
-        self._push(self._promised(node, node, self._gains(scores), WORTH if node.passes and not random else CLOSE))
+        self._push(self._promised(node, node, self._gains(scores), WORTH if node.passes and not node.random else CLOSE))
         self._push([m for e in self._joining(node) if (e.settings or e.observed) and (m := self._built_in(node, e))])
         return node
 
@@ -610,23 +616,6 @@ class ModelSearch:
         sizes = (*self._sizes(node), {own[0]: values[own[0]]})
         return _Move(-(gain + node.attainable + self._one_more), self.count, hypothesis, values, sizes)
 
-    def _fit_at_the_file(self) -> None:
-        """Fit the effect that promises most from the file's own start values.
-
-        A baseline that lacks something large makes up for it where its parameters should not be, and there the scores mislead.
-        """
-        likelihood = Likelihood(self._problem(Hypothesis(), {}), rtol=SEARCH_RTOL)
-        x = next(iter(wide_starts(likelihood, {}, self.progress)), None)
-        if x is None:
-            return
-        self.progress("scores at the start values")
-        found = StateSpaceFit(likelihood, maximise(likelihood, x, steps=0, widths=()))
-        node = self._passed(Hypothesis(), found)
-        wide = {n: found.values[n] for n in FIELD}
-        for move in self._promised(node, node, self._gains(self._scores(node)), WORTH, noise=False)[:1]:
-            with contextlib.suppress(SrfError):  # it cannot be followed from there
-                self._record(self.fit(replace(move, values=move.values | wide)))
-
     def _refit_elsewhere(self, node: Fitted) -> None:
         """Fit a model that fails a test anew where a scan, or another size of what is built in, leads somewhere likelier."""
         if node.name == self.baseline.name:
@@ -692,7 +681,8 @@ class ModelSearch:
         self.fitted = dict(self.fitted)
         try:
             problem = self._problem(node.hypothesis, node.fit.values)
-            found = self._state_space(problem, start=_followable(node.fit.values, problem), **{**self.options, "cautious": True})
+            options = {"processes": node.fit.likelihood.processes, **self.options}  # more are for what is left of the best model
+            found = self._state_space(problem, start=_followable(node.fit.values, problem), **options)
             loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
             if loud or log_evidence(found) < log_evidence(node.fit) + CLOSE:
                 return node
