@@ -1,6 +1,6 @@
 """What the stated confidence of a sealed trial should have been: its temper, its share of the unknown, and what they are worth.
 
-    python benchmarks/calibration.py TRIAL [TRIAL ...] [--check TRIAL] [--temper 3]
+    python benchmarks/calibration.py TRIAL [TRIAL ...] [--tempered TRIAL] [--check TRIAL]
 
 Each TRIAL is a folder of `srf prove`, unsealed. A confidence is exp(log evidence), normalised over the models that were fitted,
 times 1 - unexplained where one passes every test; where none does, 1 - missed is what `unknown` has. Up to the sixteenth trial
@@ -29,6 +29,7 @@ from srfcli.validation.blind import read_answers
 from srfcli.validation.cases import unseal
 from srfcli.validation.marks import Mark, calibrated, calibration_of, hypothesis
 
+TEMPERED = 3.0  # by which log evidence was divided up to the sixteenth trial
 TEMPERS = np.geomspace(0.5, 60.0, 97)
 LEAST = 0.5  # cases that are added to each side of a share, so that none is 0 or 1 (Jeffreys)
 FLOOR = 1e-3  # least probability that a truth is given: of a model that was never fitted
@@ -125,15 +126,15 @@ def read(folders: Sequence[Path]) -> list[Mark]:
 def main() -> None:
     """Fit the three numbers to the trials, say what they are worth, and check them on another trial."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("trials", type=Path, nargs="+")
+    parser.add_argument("trials", type=Path, nargs="*")
+    parser.add_argument("--tempered", type=Path, action="append", default=[], help="a trial up to the sixteenth")
     parser.add_argument("--check", type=Path, action="append", default=[])
-    parser.add_argument("--temper", type=float, default=1.0, help="by which log evidence was divided where these were stated")
     given = parser.parse_args()
 
-    def now(folders: Sequence[Path]) -> list[Mark]:
-        return [restated(m, (1 / given.temper, UNEXPLAINED, MISSED)) for m in read(folders)]
+    def now(folders: Sequence[Path], temper: float = 1.0) -> list[Mark]:
+        return [restated(m, (1 / temper, UNEXPLAINED, MISSED)) for m in read(folders)]
 
-    report, marks = Report("calibration", __doc__ or ""), now(given.trials)
+    report, marks = Report("calibration", __doc__ or ""), [*now(given.tempered, TEMPERED), *now(given.trials)]
     best, rng = fitted(marks), np.random.default_rng(0)
     share, chosen = shares(marks), rng.integers(len(marks), size=(DRAWS, len(marks)))
     drawn = np.array([fitted([marks[i] for i in own], share[own]) for own in chosen])
@@ -142,7 +143,7 @@ def main() -> None:
     numbers = zip(names, stated, best, low, high, strict=True)
     rows = [(n, f"{s:g}", f"{b:.3g}", f"{a:.3g} to {c:.3g}") for n, s, b, a, c in numbers]
     report.table(("number", "as it is", "likeliest", "95 %"), rows)
-    tell(report, "as they were stated", read(given.trials))
+    tell(report, "as they were stated", read([*given.tempered, *given.trials]))
     tell(report, "as they would be stated now", marks)
     tell(report, "each fifth by the numbers of the others", by_others(marks))
     for folder in given.check:
