@@ -130,11 +130,14 @@ def main() -> None:
     parser.add_argument("--tempered", type=Path, action="append", default=[], help="a trial up to the sixteenth")
     parser.add_argument("--check", type=Path, action="append", default=[])
     given = parser.parse_args()
+    if not (given.trials or given.tempered):
+        parser.error("give a TRIAL, or one with --tempered")
 
-    def now(folders: Sequence[Path], temper: float = 1.0) -> list[Mark]:
-        return [restated(m, (1 / temper, UNEXPLAINED, MISSED)) for m in read(folders)]
+    def now(marks: Sequence[Mark], temper: float = 1.0) -> list[Mark]:
+        return [restated(m, (1 / temper, UNEXPLAINED, MISSED)) for m in marks]
 
-    report, marks = Report("calibration", __doc__ or ""), [*now(given.tempered, TEMPERED), *now(given.trials)]
+    before, since = read(given.tempered), read(given.trials)
+    report, marks = Report("calibration", __doc__ or ""), [*now(before, TEMPERED), *now(since)]
     best, rng = fitted(marks), np.random.default_rng(0)
     share, chosen = shares(marks), rng.integers(len(marks), size=(DRAWS, len(marks)))
     drawn = np.array([fitted([marks[i] for i in own], share[own]) for own in chosen])
@@ -143,11 +146,11 @@ def main() -> None:
     numbers = zip(names, stated, best, low, high, strict=True)
     rows = [(n, f"{s:g}", f"{b:.3g}", f"{a:.3g} to {c:.3g}") for n, s, b, a, c in numbers]
     report.table(("number", "as it is", "likeliest", "95 %"), rows)
-    tell(report, "as they were stated", read([*given.tempered, *given.trials]))
+    tell(report, "as they were stated", [*before, *since])
     tell(report, "as they would be stated now", marks)
     tell(report, "each fifth by the numbers of the others", by_others(marks))
     for folder in given.check:
-        other = now([folder])
+        other = now(read([folder]))
         tell(report, f"{folder.name}, as they would be stated now", other)
         tell(report, f"{folder.name}, by these numbers", [restated(m, best) for m in other])
 

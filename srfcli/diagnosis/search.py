@@ -680,9 +680,8 @@ class ModelSearch:
         )  # fmt: skip
         self.fitted = dict(self.fitted)
         try:
-            problem = self._problem(node.hypothesis, node.fit.values)
-            options = {"processes": node.fit.likelihood.processes, **self.options}  # more are for what is left of the best model
-            found = self._state_space(problem, start=_followable(node.fit.values, problem), **options)
+            problem, processes = self._problem(node.hypothesis, node.fit.values), node.fit.likelihood.processes
+            found = self._from_there(node, problem, processes)  # more processes are for what is left of the best model
             loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
             if loud or log_evidence(found) < log_evidence(node.fit) + CLOSE:
                 return node
@@ -697,11 +696,14 @@ class ModelSearch:
                 self.experiment, self.whole, self.fitted = before
         return self.fitted[node.name]
 
+    def _from_there(self, node: Fitted, problem: Problem, processes: Sequence[str] | None) -> StateSpaceFit:
+        """Return a fit of a problem from where a model stands, with coloured gauge noise as given, or as much as it wants."""
+        start = _followable(node.fit.values, problem)
+        return self._state_space(problem, start=start, **{**self.options, "processes": processes})
+
     def _refitted(self, node: Fitted, processes: Sequence[str] | None) -> Fitted:
         """Return a fitted model with other gauge noise, which takes its place."""
-        problem = node.fit.likelihood.problem
-        start = _followable(node.fit.values, problem)
-        found = self._state_space(problem, start=start, **{**self.options, "processes": processes})
+        found = self._from_there(node, node.fit.likelihood.problem, processes)
         try:
             return self._record(self._judged(node.hypothesis, found), anew=True)
         except SrfError:  # it stays as it was
