@@ -1,15 +1,18 @@
-"""What parts of the diagnosis are worth: the cases of a sealed bank once more, with a part left out.
+"""What parts and constants of the diagnosis are worth: cases of a sealed bank once more, with one left out or changed.
 
     python benchmarks/ablations.py BANK TRUTHS --beside answers.jsonl [--known known.jsonl] [--without PART]
-        [--cases N] [--workers N] [--kept FOLDER]
+        [--with CONSTANT=VALUE] [--quickest N] [--cases N] [--workers N] [--kept FOLDER]
 
 BANK is a folder of cases as `srf prove` makes, TRUTHS their truths, answers.jsonl and known.jsonl those of the trial: what the
-whole diagnosis said of the same cases, and what was visible. The first N cases are taken, all of them if left out.
+whole diagnosis said of the same cases, and what was visible. Of the first N cases, or of all, those are taken that the whole
+diagnosis answered in the least CPU.
 
 field       friction is deterministic: no model has a random friction field
 colour      the gauge's noise is white in every model
 projection  effects are scored by what they explain of the misfit alone: what parameters, field or gauge noise could explain as
             well is not taken off
+
+A constant is one of `srfcli.diagnosis` or `srfcli.inference`, which has one meaning wherever it is used.
 
 What the held-out runs are worth, and what the Bayesian information criterion alone would choose, needs no second diagnosis:
 those tables are in the trial's own report.
@@ -19,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -67,18 +71,38 @@ class WithoutProjection(ModelSearch):
 PARTS: dict[str, type[ModelSearch]] = {"field": WithoutField, "colour": WithoutColour, "projection": WithoutProjection}
 
 
-def answered(bank: Path, part: str, names: Sequence[str], workers: int, kept: Path | None) -> Iterator[Answer]:
-    """Yield the answers to these cases without a part; those in the folder `kept` are not sought again."""
-    path = kept / f"without-{part}-{bank.name}.jsonl" if kept else None
+def diagnose_with(folder: Path, plugins: tuple[Path, ...], *, constant: str) -> Answer:
+    """Return what the diagnosis says where a constant has another value, given as `NAME=VALUE`."""
+    name, _, value = constant.partition("=")
+    import srfcli.diagnosis.verdict  # noqa: F401  all that it uses
+
+    places = [m for n, m in sys.modules.items() if n.startswith(("srfcli.diagnosis.", "srfcli.inference.")) and hasattr(m, name)]
+    if not places:
+        raise SystemExit(f"no module of the diagnosis has a constant {name}")
+    before = getattr(places[0], name)
+    try:
+        for module in places:
+            setattr(module, name, type(before)(float(value)))
+        return diagnose_case(folder, plugins)
+    finally:  # the process answers other cases later
+        for module in places:
+            setattr(module, name, before)
+
+
+def answered(bank: Path, change: str, names: Sequence[str], workers: int, kept: Path | None) -> Iterator[Answer]:
+    """Yield the answers to these cases under a change; those in the folder `kept` are not sought again."""
+    path = kept / f"{change.replace(' ', '-')}-{bank.name}.jsonl" if kept else None
     known = read_answers(path) if path else {}
     waiting = [name for name in names if name not in known]
-    tasks = [Task(bank / name, (), functools.partial(diagnose_case, by=PARTS[part]), LIMIT) for name in waiting]
+    how, _, what = change.partition(" ")
+    by = functools.partial(diagnose_case, by=PARTS[what]) if how == "without" else functools.partial(diagnose_with, constant=what)
+    tasks = [Task(bank / name, (), by, LIMIT) for name in waiting]
     found = dict(known)
     for _, answer in run_processes(
         answer_case, tasks, workers=workers, lost=lambda i: failed(waiting[i], "its process was killed")
     ):
         found[answer.case] = answer
-        print(part, answer.case, answer.said or answer.verdict, f"{answer.cpu:.0f} s", answer.failure, flush=True)
+        print(change, answer.case, answer.said or answer.verdict, f"{answer.cpu:.0f} s", answer.failure, flush=True)
         if path:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_answers(path, found.values())
@@ -86,25 +110,31 @@ def answered(bank: Path, part: str, names: Sequence[str], workers: int, kept: Pa
 
 
 def main() -> None:
-    """Answer the cases without each part, mark the answers beside the whole diagnosis's, print the tables."""
+    """Answer the cases under each change, mark the answers beside the whole diagnosis's, print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("bank", type=Path)
     parser.add_argument("truths", type=Path)
     parser.add_argument("--beside", type=Path, required=True, help="answers.jsonl of the trial, marked beside")
     parser.add_argument("--known", type=Path, help="known.jsonl of the trial: what was visible")
-    parser.add_argument("--without", action="append", choices=sorted(PARTS), help="part to leave out; default: each")
+    parser.add_argument("--without", action="append", default=[], choices=sorted(PARTS), help="part to leave out")
+    parser.add_argument("--with", dest="constants", action="append", default=[], help="a constant and its value: WORTH=24")
     parser.add_argument("--cases", type=int, help="how many cases to take, from the first on")
+    parser.add_argument("--quickest", type=int, help="how many of these to take, by the CPU of the whole diagnosis")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--kept", type=Path, help="folder of the answers: a later run goes on there")
     given = parser.parse_args()
     whole = read_answers(given.beside)
     names = sorted(whole)[: given.cases]
-    parts = given.without or sorted(PARTS)
-    found = {part: list(answered(given.bank, part, names, given.workers, given.kept)) for part in parts}
+    names = sorted(sorted(names, key=lambda n: whole[n].cpu)[: given.quickest])
+    changes = [f"without {part}" for part in given.without] + [f"with {constant}" for constant in given.constants]
+    changes = changes or [f"without {part}" for part in sorted(PARTS)]
+    found = {change: list(answered(given.bank, change, names, given.workers, given.kept)) for change in changes}
     truths = unseal(given.bank, given.truths)  # only now
     report = Report("ablations", __doc__ or "")
     heading(report, f"bank {given.bank.name}", len(names), given.known)
-    answers = {"whole": [whole[name] for name in names]} | {f"without {part}": found[part] for part in parts}
+    if given.quickest:
+        report.say("# those that the whole diagnosis answered in the least CPU")
+    answers = {"whole": [whole[name] for name in names]} | found
     marks = {who: marked(truths, listed, given.known) for who, listed in answers.items()}
     rows = []
     for who, listed in marks.items():
@@ -113,10 +143,11 @@ def main() -> None:
         turned = sum(a.right and not b.right for a, b in zip(marks["whole"], listed, strict=True))
         mended = sum(b.right and not a.right for a, b in zip(marks["whole"], listed, strict=True))
         span = f"{low:.2f} to {high:.2f}" if low is not None and high is not None else "-"
-        rows.append((who, f"{right.hits} of {right.count}", span, str(turned), str(mended)))
-    report.say("\nright, its interval (Wilson, 95 %); cases that the whole has right and this wrong, and the reverse")
-    report.table(("diagnosis", "right", "interval", "lost", "won"), rows)
-    for who, listed in marks.items():
+        cpu = sum(a.cpu for a in answers[who])
+        rows.append((who, f"{right.hits} of {right.count}", span, str(turned), str(mended), f"{cpu:.0f} s"))
+    report.say("\nright, its interval (Wilson, 95 %); cases that the whole has right and this wrong, and the reverse; CPU of all")
+    report.table(("diagnosis", "right", "interval", "lost", "won", "cpu"), rows)
+    for who, listed in marks.items() if given.without or not given.constants else ():
         tell(report, listed, who)
 
 

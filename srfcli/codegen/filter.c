@@ -23,6 +23,7 @@ typedef double quad __attribute__((vector_size(32), may_alias)); /* wider vector
 #define GAUGE -1
 #define SPRING -2
 #define NO_VARIANCE 1e150                   /* a variance that is none any more */
+#define MANY 1000                           /* steps between two readings, after which their pace is looked at */
 
 typedef struct {
     double x[NA], P[NA * NA], T[NA * NA];   /* mean and covariance of state and gauge noise; transition since the last sample */
@@ -261,9 +262,12 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
 static NOINLINE int advance(Imposed *force, Course *course, Belief *belief, double a, double b) {
     double V, W, W_dot, Z[NZ], Z0[NZ], J0[NX * NX], f0[NX], carry = 0.0;
     int rejected = 0, unseen = 0, first = course->first;
+    const long begun = course->steps + course->rejected;
     Node now;
     now.t = a;
     while (now.t < b) {
+        long taken = course->steps + course->rejected - begun;
+        if (taken > MANY && (now.t - a) * course->max_steps < (b - a) * taken) return 0; /* at this pace it never gets there */
         memcpy(now.x, belief->x, sizeof now.x);
         imposed(force, now.t, &V, &W, &W_dot);
         memset(now.f, 0, sizeof now.f);

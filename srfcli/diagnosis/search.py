@@ -337,9 +337,9 @@ class ModelSearch:
             base = self._expand(self._with_own_noise(base))
             if taken_up(base.fit):  # field or noise make up for what is missing: without them it shows, or it is another law
                 self._take(self._expand_without_field, base)
-                if self.queue:
+                if self._promising(base):
                     self._fit_next(heapq.heappop(self.queue))
-                if not self.best().passes or self.best().random:
+                if self.best().name == base.name:
                     self._take(self._try_laws_afresh, base)
             elif not base.passes:
                 self._try_ageing_laws(self.best())
@@ -370,8 +370,10 @@ class ModelSearch:
     def _steps(self) -> list[_Step]:
         """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
         best, base = self.best(), self.baseline
-        if best.passes:  # other laws are tried near it alone: fits from the file's values take half of the time
-            steps: list[_Step] = [(self._try_ageing_laws, best), (self._expand_without_field, base)]
+        if best.passes:  # other laws are tried near it alone, unless field or noise are there to make up for a law
+            masked = taken_up(base.fit) and best.random and not best.hypothesis.ageing
+            steps: list[_Step] = [(self._try_laws_afresh, base) if masked else (self._try_ageing_laws, best)]
+            steps += [(self._expand_without_field, base)]
         else:
             steps = [*((self._refit_elsewhere, f) for f in (self._simplest(), best)), (self._try_laws_afresh, base)]
             steps += [(self._try_ageing_laws, best)] if best.hypothesis.ageing else []
@@ -437,9 +439,15 @@ class ModelSearch:
         return node.scores is None and len(node.hypothesis.effects) < MOST_EFFECTS
 
     def _search(self) -> None:
-        """Fit what comes close to the best model, or would mend it; expand the best once nothing does."""
+        """Fit what comes close to the best model, or would mend it; expand the best once nothing does.
+
+        An effect that was fitted in one run alone, and mends it by halves, is tried in all runs at once.
+        """
         while not self.spent:
             best = self.best()
+            if not best.passes and (self._in_all_runs, best.name) not in self._taken:
+                self._take(self._in_all_runs, best)
+                continue
             if not self._promising(best):
                 if not self._expandable(best):
                     break
@@ -603,7 +611,7 @@ class ModelSearch:
         for size in np.geomspace(max(low, high / BUILT_SPAN), high, BUILT):
             y = x.copy()
             y[place] = np.log(size) if likelihood.logarithmic[place] else size
-            trials.append((likelihood.at(y, slopes=False).log_likelihood, y))
+            trials.append((likelihood.at(y, slopes=False, like=node.fit.maximum.point).log_likelihood, y))
         best, x = max(trials, key=lambda t: t[0])
         if not np.isfinite(best):
             return None
@@ -747,64 +755,89 @@ class ModelSearch:
         return {**score.values, first: begun + ratio * score.size}
 
     def _try_laws_afresh(self, base: Fitted) -> None:
-        """Push the other ageing laws, the file's own values tried, too: an effect, or the field, may pass for another law."""
-        self._try_ageing_laws(self.best(), afresh=True)
+        """Fit the other ageing laws, the file's own start values tried, too: an effect, or the field, may pass for another law.
 
-    def _try_ageing_laws(self, best: Fitted, *, afresh: bool = False) -> None:
+        A fit that has made up for a wrong law may stand where no step leads to the right one. The likeliest at the file's values
+        is fitted first, and none any more once one passes; what is far behind after a few steps, without coloured noise, is left:
+        behind another law, or behind a best model that passes.
+        """
+        best = self.best()
+        if not self.experiment.runs:
+            self._try_ageing_laws(best)
+            return
+        begun = []
+        for hypothesis, beside in self._other_laws(best):
+            own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
+            start = (wide_starts(own, {}, self.progress) or starts_elsewhere(own, own.coordinates({}), self.progress))[0]
+            begun.append((own.at(start, slopes=False).log_likelihood, own, start, hypothesis, beside))
+        highest = self._without_colour(best) if best.passes else -np.inf
+        for _, own, start, hypothesis, beside in sorted(begun, key=lambda b: -b[0]):
+            places = [near] if (near := self._near(hypothesis, beside)) else []
+            found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
+            if found.away > 1.0 and found.point.log_likelihood > highest - HOPELESS:
+                found = maximise(own, found.point.x, close=1.0, progress=self.progress)
+            highest = max(highest, found.point.log_likelihood)
+            places.append((own, found))
+            if beside.processes and found.point.log_likelihood > highest - HOPELESS:
+                noise = {n: v for n, v in self.baseline.fit.values.items() if n.startswith("gauge_")}
+                x = beside.coordinates({**found.point.values, **noise})
+                places.append((beside, maximise(beside, x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)))
+            if not (move := self._law_move(hypothesis, *max(places, key=lambda p: p[1].point.log_likelihood))):
+                continue
+            best = self.best()
+            if -move.expected > best.evidence - (CLOSE if best.passes else HOPELESS):
+                self._fit_next(move)
+            else:
+                self._push([move])
+            if self.best().passes and self.best().hypothesis.ageing:
+                return
+
+    def _without_colour(self, node: Fitted) -> float:
+        """Return the log likelihood of a fitted model where its gauge noise is white."""
+        plain = node.fit.likelihood.beside(node.fit.likelihood.problem, ())
+        x = plain.coordinates({n: v for n, v in node.fit.values.items() if not n.startswith("gauge_")})
+        found = maximise(plain, x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
+        return found.point.log_likelihood
+
+    def _try_ageing_laws(self, best: Fitted) -> None:
         """Push the other ageing laws, each after a few steps from where the baseline or the best model stands.
 
-        `afresh` also from the file's own values: a fit that has made up for a wrong law may stand where no step leads to the
-        right one. The law that promises most goes on from there: the right one lies further off than a step tells.
+        The law that promises most goes on from there: the right one lies further off than a step tells.
         """
-        node = self.baseline
-        parents = (node,) if best is node else (node, best)
-        stated, *modifiers = self.experiment.choice.ageing.split("+")
-        least = node.fit.log_likelihood + (WORTH if node.passes else -HOPELESS)  # log likelihood
-        reached: list[tuple[float, Hypothesis, Likelihood, Maximum]] = []
-        for name in self.laws:
-            hypothesis = Hypothesis((), "+".join([name, *modifiers]))
-            if name == stated or hypothesis == best.hypothesis:
-                continue
-            likelihood = self._likelihood(hypothesis, node, name)
-            if likelihood is None:
-                continue
-            starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in parents]
-            heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts] if len(starts) > 1 else [0.0]
-            x = starts[int(np.argmax(heights))]
-            places: list[tuple[Likelihood, Maximum]] = []
-            if not np.array_equal(x, self._tried.get(name, ())):  # else what came of it is in the queue
-                near = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
-                places.append((likelihood, near))
-            if afresh and self.experiment.runs:
-                places += self._from_the_file(likelihood, hypothesis, node)
-            self._tried[name] = x
-            if places:  # far from a maximum a promise says nothing
-                likelihood, found = max(places, key=lambda p: p[1].point.log_likelihood)
-                if found.promised > least:
-                    reached.append((found.promised, hypothesis, likelihood, found))
-        reached.sort(key=lambda r: -r[0])
-        for number, (promise, hypothesis, likelihood, found) in enumerate(reached):
+        reached = [(law[0], *near) for law in self._other_laws(best) if (near := self._near(*law))]
+        for number, (hypothesis, likelihood, found) in enumerate(sorted(reached, key=lambda r: -r[2].promised)):
             if number == 0 and found.away > 1.0:
                 found = maximise(likelihood, found.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
-                promise = found.promised
-            self.count += 1
-            expected = promise - node.fit.log_likelihood + node.attainable
-            bare = node.fit.likelihood.processes and not likelihood.processes  # its noise is to be estimated anew
-            values = {n: v for n, v in found.point.values.items() if not (bare and n.startswith("gauge_"))}
-            heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, values, ()))
+            self._push([move] if (move := self._law_move(hypothesis, likelihood, found)) else [])
 
-    def _from_the_file(
-        self, likelihood: Likelihood, hypothesis: Hypothesis, node: Fitted
-    ) -> Iterator[tuple[Likelihood, Maximum]]:
-        """Return the maximum from the file's start values without colour, and where a model's coloured noise leads from it."""
-        own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
-        start = (wide_starts(own, {}, self.progress) or starts_elsewhere(own, own.coordinates({}), self.progress))[0]
-        found = maximise(own, start, close=1.0, progress=self.progress)
-        yield own, found
-        if likelihood.processes:
-            noise = {n: v for n, v in node.fit.values.items() if n.startswith("gauge_")}
-            x = likelihood.coordinates({**found.point.values, **noise})
-            yield likelihood, maximise(likelihood, x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
+    def _other_laws(self, best: Fitted) -> list[tuple[Hypothesis, Likelihood]]:
+        """Return the ageing laws that neither the baseline nor the best model has, each with its likelihood."""
+        stated, *modifiers = self.experiment.choice.ageing.split("+")
+        others = ((name, Hypothesis((), "+".join([name, *modifiers]))) for name in self.laws if name != stated)
+        own = ((h, self._likelihood(h, self.baseline, name)) for name, h in others if h != best.hypothesis)
+        return [(hypothesis, likelihood) for hypothesis, likelihood in own if likelihood is not None]
+
+    def _near(self, hypothesis: Hypothesis, likelihood: Likelihood) -> tuple[Likelihood, Maximum] | None:
+        """Return where a few steps lead a law from where the baseline or the best stands; None if they did already."""
+        parents = {f.name: f for f in (self.baseline, self.best())}.values()
+        starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in parents]
+        heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts] if len(starts) > 1 else [0.0]
+        x = starts[int(np.argmax(heights))]
+        if np.array_equal(x, self._tried.get(hypothesis.name, ())):
+            return None
+        self._tried[hypothesis.name] = x
+        return likelihood, maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
+
+    def _law_move(self, hypothesis: Hypothesis, likelihood: Likelihood, found: Maximum) -> _Move | None:
+        """Return a model of another law that goes on from where it was led to; None where it promises too little."""
+        node = self.baseline
+        if not found.promised > node.fit.log_likelihood + (WORTH if node.passes else -HOPELESS):
+            return None
+        self.count += 1
+        expected = found.promised - node.fit.log_likelihood + node.attainable
+        bare = node.fit.likelihood.processes and not likelihood.processes  # its noise is to be estimated anew
+        values = {n: v for n, v in found.point.values.items() if not (bare and n.startswith("gauge_"))}
+        return _Move(-expected, self.count, hypothesis, values, ())
 
     def _in_all_runs(self, best: Fitted) -> None:
         """Fit the best model with its effects in all runs: the score of one run may have been misled by what was missing then."""

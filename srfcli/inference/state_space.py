@@ -620,10 +620,13 @@ class Likelihood:
             return self.best
         values, k = self.values(x), len(self.names)
         self.evaluations += 1
-        most = {f.run.name: MOST_WORK * f.found.steps for f in like.runs} if like else {}
+        most, failed = {f.run.name: MOST_WORK * f.found.steps for f in like.runs} if like else {}, False
 
         def one(run: Run) -> Filtered:
-            return self.filtered(run, values, slopes=slopes, keep=keep, most=most.get(run.name))
+            nonlocal failed  # then the others are not needed
+            found = self.filtered(run, values, slopes=slopes, keep=keep, most=0 if failed else most.get(run.name))
+            failed = failed or not found.whole
+            return found
 
         runs = tuple(self.over_runs(one))
         total = float(sum(f.log_likelihood for f in runs))
@@ -1257,7 +1260,7 @@ def _fitted(
         if found.promised < least and processes is not None:
             return best
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
-    best = first = _with_colour(best, likelihood, progress, cautious) if processes is None else best
+    best = first = _with_colour(best, likelihood, progress, cautious, least) if processes is None else best
     if best.maximum.promised < least:
         return best
     best = _with_or_without(best, smooth, likelihood, close, progress)
@@ -1476,11 +1479,13 @@ def _with_colour(
     likelihood: Callable[[bool, Sequence[str]], Likelihood],
     progress: Callable[[str], None],
     cautious: bool = False,
+    least: float = -np.inf,
 ) -> StateSpaceFit:
     """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants; if `cautious`, see there.
 
     One whose correlation falls off exponentially is tried first, an oscillation where that leaves most stretches correlated: what
-    the physics lack leaves a few.
+    the physics lack leaves a few. No more are tried where as many as there may be, each with the gain of the last, would leave
+    the log likelihood below `least`.
     """
     while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > DEVIATION:
         if cautious and known and not steadily_coloured(best, cautious):
@@ -1493,7 +1498,9 @@ def _with_colour(
                 break
         if found is best:
             break
-        best = found
+        last, best = found.maximum.promised - best.maximum.promised, found
+        if found.maximum.promised + max(last, 0.0) * (GAUGE_PROCESSES - len(found.likelihood.processes)) < least:
+            break
     return best
 
 
