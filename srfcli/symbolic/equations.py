@@ -589,13 +589,18 @@ def _eliminated(matrix: sp.Matrix, right: sp.Matrix, system: System) -> list[sp.
     return [found[j] for j in range(len(rows))]
 
 
+@lru_cache(maxsize=4096)  # models that differ by an effect have most entries of their Jacobians in common
 def tidy(expression: sp.Expr) -> sp.Expr:
-    """Return the shortest of a few equal forms of `expression`."""
-    forms = [expression, sp.factor_terms(expression)]
-    if sp.count_ops(expression) <= MAX_CANCEL:
+    """Return the shortest of a few equal forms of `expression`, of equally short ones the first by its text."""
+    if expression.is_Atom:
+        return expression
+    sizes = {form: sp.count_ops(form) for form in (expression, sp.factor_terms(expression))}
+    if sizes[expression] <= MAX_CANCEL:
         shielded, back = shield(expression)
-        forms.append(sp.cancel(shielded).xreplace(back))
-    return min(forms, key=lambda e: (sp.count_ops(e), str(e)))
+        form = sp.cancel(shielded).xreplace(back)
+        sizes[form] = sp.count_ops(form)
+    shortest = [form for form, size in sizes.items() if size == min(sizes.values())]
+    return min(shortest, key=str) if len(shortest) > 1 else shortest[0]
 
 
 def settle(expression: sp.Expr) -> sp.Expr:
