@@ -18,8 +18,9 @@ from srfcli.inference.noise import Noise, difference_level, estimate_noise, lag_
 from srfcli.inference.posterior import profile
 from srfcli.inference.prediction import basis, own_names, own_start, predict
 from srfcli.inference.recordings import fit_from_several
-from srfcli.inference.state_space import as_fit, fit_state_space
+from srfcli.inference.state_space import StateSpaceFit, as_fit, fit_state_space
 from srfcli.motion.imposed import ConstantLoad, Drive, Modulation
+from srfcli.results.fit import said_likelier
 
 ROCK = ModelChoice("dieterich-ruina", "ruina", "rigid", False)
 ROCK_TRUE = {"mu0": 0.6, "A": 0.008, "B": 0.010, "D0": 10.0}
@@ -175,6 +176,21 @@ def test_profile_of_a_nearly_linear_parameter(rock_model):
     half = 1.96 * as_fit(found).stderr["mu0"]
     assert interval.high - found.values["mu0"] == pytest.approx(half, rel=0.05)
     assert found.values["mu0"] - interval.low == pytest.approx(half, rel=0.05)
+
+
+def test_a_profile_says_where_a_refit_is_likelier_than_the_fit(rock_model):
+    """A fit that was broken off stands below the maximum; one at its maximum has nothing likelier beside it."""
+    problem = fit_problem(rock_model, rock(rock_model))
+    whole = fit_state_space(problem, smooth=True)
+    assert profile(whole, "A").likelier is None
+    own, truth = whole.likelihood, whole.maximum.point.x
+    far = truth + np.sqrt(np.diag(whole.maximum.covariance)) * np.where(np.arange(truth.size) == own.names.index("D0"), 3.0, 0.0)
+    broken = StateSpaceFit(own, replace(whole.maximum, point=own.at(far)))
+    interval = profile(broken, "A")
+    assert interval.gain == pytest.approx(whole.log_likelihood - broken.log_likelihood, abs=2.0) and interval.gain > 2
+    assert interval.likelier["D0"] == pytest.approx(whole.values["D0"], rel=0.1)
+    (said,) = said_likelier([profile(whole, "A"), interval], lambda name, x: ("um" if name == "D0" else "1", [x]))
+    assert "in the profile of A, is likelier by" in said and f"D0 = {interval.likelier['D0']:.5g}" in said
 
 
 def test_trend_and_free_start_are_fitted(rock_model):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError
 from srfcli.inference.fit import root
-from srfcli.inference.profile import CHI2_95, Interval, interval_end, quadratic
+from srfcli.inference.profile import CHI2_95, Interval, Refits, interval_end, quadratic
 from srfcli.inference.state_space import CLOSER, StateSpaceFit, along, maximise
 
 # Profile likelihood: each parameter held at a value, the others refitted.
@@ -21,14 +21,14 @@ from srfcli.inference.state_space import CLOSER, StateSpaceFit, along, maximise
 
 def profile(found: StateSpaceFit, name: str, *, progress: Callable[[str], None] = lambda text: None) -> Interval:
     """Return the profile-likelihood interval of one parameter, the others with field and gauge noise refitted."""
-    before, ends = found.likelihood.evaluations, []
+    before, ends, refits = found.likelihood.evaluations, [], Refits()
     for side in (-1.0, 1.0):
-        ends.append(_end(found, name, side))
+        ends.append(_end(found, name, side, refits))
         progress(f"{name}: {'upper' if side > 0 else 'lower'} end")
-    return Interval(name, ends[0], ends[1], found.likelihood.evaluations - before)
+    return Interval(name, ends[0], ends[1], found.likelihood.evaluations - before, refits.gain, refits.likelier)
 
 
-def _end(found: StateSpaceFit, name: str, side: float) -> float | None:
+def _end(found: StateSpaceFit, name: str, side: float, refits: Refits) -> float | None:
     """Return where the profile crosses CHI2_95 on one side."""
     likelihood, best, covariance = found.likelihood, found.maximum.point.x, found.maximum.covariance
     k = likelihood.names.index(name)
@@ -43,7 +43,8 @@ def _end(found: StateSpaceFit, name: str, side: float) -> float | None:
         start[k] = value
         point = maximise(likelihood, start, held=(name,), close=CLOSER).point
         x = point.x if np.isfinite(point.log_likelihood) else x
-        return 2 * (found.log_likelihood - point.log_likelihood)
+        own = {n: point.values[n] for n in likelihood.problem.names}
+        return refits.met(2 * (found.log_likelihood - point.log_likelihood), own)
 
     distance = interval_end(deviance, error, float(room))
     if distance is None:

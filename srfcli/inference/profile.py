@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,17 +11,36 @@ CHI2_95 = 3.841458820694124  # of chi-squared with one degree of freedom, 95 %
 OPEN_INTERVAL = 8.0  # half-widths that the standard error wants: an interval that has not ended there is open
 REFITS = 12  # of one end at most; the secant needs three or four
 SETTLED = 0.01  # in the root of the deviance, which is 1.96 at the end: half a per cent of the interval
+LIKELIER = 0.05  # in log likelihood, above the fit: a refit is a likelier maximum then, and no rest of convergence
 FARTHER = 1.5  # times 1.96 standard errors: an interval cut there misses the value on that side in 10 of 100 cases, not in 2.5
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A 95 % interval of one parameter, in um, s, N; None where the likelihood does not end it before a bound."""
+    """A 95 % interval of one parameter, in um, s, N; None where the likelihood does not end it before a bound.
+
+    `likelier` are the parameters of the likeliest refit where that is likelier than the fit, by `gain` in log likelihood.
+    """
 
     name: str
     low: float | None
     high: float | None
     evaluations: int
+    gain: float = 0.0
+    likelier: Mapping[str, float] | None = None
+
+
+class Refits:
+    """The refits of one parameter's profile: the likeliest of those that are likelier than the fit."""
+
+    def __init__(self) -> None:
+        self.gain, self.likelier = 0.0, None  # type: float, Mapping[str, float] | None
+
+    def met(self, deviance: float, values: Mapping[str, float]) -> float:
+        """Return a refit's deviance, when it was looked at."""
+        if -0.5 * deviance > max(self.gain, LIKELIER):
+            self.gain, self.likelier = -0.5 * deviance, values
+        return deviance
 
 
 def quadratic(deviances: Sequence[float]) -> bool:

@@ -19,7 +19,7 @@ from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.thresholds import Thresholds
 from srfcli.inference.free_parameters import RHO, Scale
-from srfcli.inference.profile import CHI2_95, Interval, interval_end, quadratic
+from srfcli.inference.profile import CHI2_95, Interval, Refits, interval_end, quadratic
 from srfcli.numerics.boundary import CHUNK, BoundaryPoint, along, linearise_boundary, polish
 from srfcli.numerics.collocation import by_mesh, join
 from srfcli.numerics.critical import critical_line
@@ -524,11 +524,18 @@ def _profiles(work: _Work, best: MethodFit) -> tuple[Interval, ...]:
     everything = np.ones(len(work.matcher.table), dtype=bool)
     for k, q in enumerate(scale):
         error, along = _ridge(scale, best, k)
-        others, ends, before = np.arange(len(scale)) != k, [], len(work.trace)
+        others, ends, before, refits = np.arange(len(scale)) != k, [], len(work.trace), Refits()
         for side, bound in zip((-1.0, 1.0), scale.bounds, strict=True):
             last = top
 
-            def deviance(distance: float, k: int = k, side: float = side, along: Array = along, others: Array = others) -> float:
+            def deviance(
+                distance: float,
+                k: int = k,
+                side: float = side,
+                along: Array = along,
+                others: Array = others,
+                refits: Refits = refits,
+            ) -> float:
                 nonlocal last
                 start = last + along * (top[k] + side * distance - last[k])
                 start[k] = top[k] + side * distance
@@ -537,11 +544,11 @@ def _profiles(work: _Work, best: MethodFit) -> tuple[Interval, ...]:
                     _trust_region(work, start, everything, others)
                 assert work.best is not None
                 last = work.best.y
-                return work.best.cost - best.cost
+                return refits.met(work.best.cost - best.cost, dict(zip(scale.names, scale.values(last).tolist(), strict=True)))
 
             distance = interval_end(deviance, error, float(abs(bound[k] - top[k])))
             ends.append(None if distance is None else q.value(float(top[k] + side * distance)))
-        found.append(Interval(q.name, ends[0], ends[1], len(work.trace) - before))
+        found.append(Interval(q.name, ends[0], ends[1], len(work.trace) - before, refits.gain, refits.likelier))
     return tuple(found)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -370,7 +370,8 @@ class FitResult(Result):
             place = [fit.names.index(i.name) for i in self.intervals]
             bounds = [(float(fit.lower[k]), float(fit.upper[k])) for k in place]
             names = [i.name for i in self.intervals]
-            return farther(self.intervals, [fit.values[n] for n in names], [fit.stderr[n] for n in names], bounds)
+            told = farther(self.intervals, [fit.values[n] for n in names], [fit.stderr[n] for n in names], bounds)
+            return said_likelier(self.intervals, self._shown) + told
         if not (found.problem.tables and found.state_space and found.status.ok):
             return []
         return said_not_quadratic(not_quadratic(found.state_space))
@@ -454,6 +455,17 @@ def farther(
                 told.append(f"{interval.name} {abs(end - value) / (1.96 * error):.1f} times as far {way}")
     said = "the likelihood is not quadratic, and standard errors are too small. 95 % intervals reach, over 1.96 standard errors, "
     return [f"{said}{', '.join(told)}: take low and high. Fewer free parameters or other data narrow them"] if told else []
+
+
+def said_likelier(intervals: Sequence[Interval], shown: Callable[[str, float], tuple[str, list[Any]]]) -> list[str]:
+    """Return a sentence where a refit of a profile is likelier than the fit; `shown` gives a parameter's unit and value in it."""
+    best = max(intervals, key=lambda i: i.gain)
+    if best.likelier is None:
+        return []
+    units, numbers = zip(*(shown(name, value) for name, value in best.likelier.items()), strict=True)
+    values = ", ".join(with_unit(f"{n} = {x:.5g}", u) for n, (x,), u in zip(best.likelier, numbers, units, strict=True))
+    where = f"a refit beside the fit, in the profile of {best.name}, is likelier by {best.gain:.2g} in log likelihood: {values}"
+    return [f"{where}. The fit has ended at a local maximum, and intervals are about that: begin at these values"]
 
 
 def load_notes(fit: Fit) -> list[str]:
@@ -613,7 +625,9 @@ class ThresholdFitResult(Result):
         if not fit.intervals:
             return said_not_quadratic(fit.not_quadratic)
         bounds = [(q.lower, q.upper) for q in fit.scale]
-        return farther(fit.intervals, best.values.tolist(), best.uncertainty.errors.tolist(), bounds)
+        told = farther(fit.intervals, best.values.tolist(), best.uncertainty.errors.tolist(), bounds)
+        declared = {q.name: q for q in fit.scale}
+        return said_likelier(fit.intervals, lambda n, x: (declared[n].parameter.unit, [declared[n].declared(x)])) + told
 
     @cached_property
     def methods(self) -> Table:
