@@ -142,6 +142,7 @@ class _Move:
     direction: Array | None = field(compare=False, default=None)  # of what its last effect is expected to explain
     shifts: Mapping[str, float] = field(compare=False, default_factory=dict)  # of other parameters that go with that
     origin: StateSpaceFit | None = field(compare=False, default=None)  # whose parameters it begins with, as they are
+    reached: float = field(compare=False, default=-np.inf)  # log evidence that was reached on the way to what is expected
 
 
 class _Spent(Exception):
@@ -337,8 +338,9 @@ class ModelSearch:
             base = self._expand(self._with_own_noise(base))
             if taken_up(base.fit):  # field or noise make up for what is missing: without them it shows, or it is another law
                 self._take(self._expand_without_field, base)
-                if self._promising(base):
-                    self._fit_next(heapq.heappop(self.queue))
+                if self._promising(base):  # what has been likelier, else what is expected to be
+                    move = max(self.queue, key=lambda m: (max(m.reached, base.evidence), -m.expected))
+                    self._fit_next(self._taken_out(move))
                 if self.best().name == base.name:
                     self._take(self._try_laws_afresh, base)
             elif not base.passes:
@@ -475,10 +477,13 @@ class ModelSearch:
     def _fit_what_waits(self, best: Fitted) -> None:
         """Fit what waits, the simplest first, until one is the best: a model that fails a test is no measure of promises."""
         while self.queue and not self.spent and self.best().name == best.name:
-            move = min(self.queue, key=lambda m: (len(m.hypothesis.reported), m.expected))
-            self.queue.remove(move)
-            heapq.heapify(self.queue)
-            self._fit_next(move)
+            self._fit_next(self._taken_out(min(self.queue, key=lambda m: (len(m.hypothesis.reported), m.expected))))
+
+    def _taken_out(self, move: _Move) -> _Move:
+        """Return a move that waited, which no longer does."""
+        self.queue = [other for other in self.queue if other is not move]
+        heapq.heapify(self.queue)
+        return move
 
     def _revise(self, move: _Move, found: Fitted) -> None:
         """Raise what is expected of effects that are like a fitted one at first order by what that gained beyond its promise."""
@@ -620,9 +625,9 @@ class ModelSearch:
         if not gain > (WORTH if node.passes else 0.0):
             return None
         self.count += 1
-        values = dict(found.point.values)
-        sizes = (*self._sizes(node), {own[0]: values[own[0]]})
-        return _Move(-(gain + node.attainable + self._one_more), self.count, hypothesis, values, sizes)
+        values, other = dict(found.point.values), node.attainable + self._one_more
+        sizes, reached = (*self._sizes(node), {own[0]: values[own[0]]}), found.point.log_likelihood - node.fit.log_likelihood
+        return _Move(-(gain + other), self.count, hypothesis, values, sizes, reached=reached + other)
 
     def _refit_elsewhere(self, node: Fitted) -> None:
         """Fit a model that fails a test anew where a scan, or another size of what is built in, leads somewhere likelier."""
@@ -758,8 +763,8 @@ class ModelSearch:
         """Fit the other ageing laws, the file's own start values tried, too: an effect, or the field, may pass for another law.
 
         A fit that has made up for a wrong law may stand where no step leads to the right one. The likeliest at the file's values
-        is fitted first, and none any more once one passes; what is far behind after a few steps, without coloured noise, is left:
-        behind another law, or behind a best model that passes.
+        is fitted first, and none any more once one passes. What is far behind after a few steps, without coloured noise, is left:
+        behind another law, or behind a model that is better than the baseline.
         """
         best = self.best()
         if not self.experiment.runs:
@@ -770,7 +775,7 @@ class ModelSearch:
             own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
             start = (wide_starts(own, {}, self.progress) or starts_elsewhere(own, own.coordinates({}), self.progress))[0]
             begun.append((own.at(start, slopes=False).log_likelihood, own, start, hypothesis, beside))
-        highest = self._without_colour(best) if best.passes else -np.inf
+        highest = self._without_colour(best) if best.name != base.name else -np.inf
         for _, own, start, hypothesis, beside in sorted(begun, key=lambda b: -b[0]):
             places = [near] if (near := self._near(hypothesis, beside)) else []
             found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)

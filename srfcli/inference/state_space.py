@@ -728,8 +728,12 @@ class Maximum:
 
     @property
     def promised(self) -> float:
-        """Return the log likelihood expected at the maximum; that of the point where scoring had yet to weigh all alike."""
-        return self.point.log_likelihood + (0.5 * self.away**2 if np.isfinite(self.away) else 0.0)
+        """Return the log likelihood expected at the maximum; that of the point where scoring had yet to weigh all alike.
+
+        Of recordings it is expected HOPELESS above the point at most: from farther off the score tells nothing of the maximum.
+        """
+        gain = 0.5 * self.away**2 if np.isfinite(self.away) else 0.0
+        return self.point.log_likelihood + (min(gain, HOPELESS) if self.point.runs else gain)
 
 
 def maximise(
