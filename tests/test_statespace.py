@@ -433,6 +433,17 @@ def test_a_maximisation_does_not_end_below_what_it_passed(make_model):
         assert found.point.log_likelihood > max(float(text.split()[2].rstrip(",")) for text in said) - 2.0
 
 
+def test_from_far_off_a_score_promises_no_more_than_there_is(make_model):
+    """Where a narrow field follows wrong parameters badly, half the squared distance in standard errors is no gain to come."""
+    true = {"mu0": 0.43, "A": 0.0128, "B": 0.0263, "D0": 0.38, "lambda": 0.55}
+    likelihood = Likelihood(of_stick_slip(make_model, "dieterich-ruina", true, 601), rtol=1e-3)
+    wide = {"gauge_white": 0.05, "field_amplitude": 0.01, "field_length": 1.0}
+    whole = maximise(likelihood, likelihood.coordinates({**true, **wide}))
+    narrow = {"gauge_white": 0.003, "field_amplitude": 3e-4, "field_length": 1.0}
+    far = maximise(likelihood, likelihood.coordinates({**true, "B": 0.03, "D0": 0.35, **narrow}), steps=1, widths=())
+    assert far.point.log_likelihood + far.away**2 / 2 > 100 * whole.point.log_likelihood > 100 * far.promised
+
+
 @pytest.mark.slow
 def test_a_compliance_is_found_by_how_the_contact_rings(make_model):
     """In stick-slip it rings at 430 Hz, read every 4 ms: one lambda in 0.5 % explains that, and nothing leads there."""
