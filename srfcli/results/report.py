@@ -109,6 +109,9 @@ class Matter:
         return picture(wide, ".svg", alt=alt, caption=caption, small=small, narrow=narrow)
 
 
+CONFIDENCE_IN = {"unknown": "something not registered", "missed": "a registered cause that was missed, or none"}
+
+
 def numbers(matter: Matter) -> Markup:
     """Return the few numbers that the verdict rests on."""
     rows = []
@@ -118,7 +121,7 @@ def numbers(matter: Matter) -> Markup:
             rows.append([label, *map(rms, values)])
     parts = [table(["residual / noise", *matter.sides()], rows, numeric=(1, 2))] if rows else []
     confidence = sorted((matter.answer.get("confidence") or {}).items(), key=lambda kv: -(kv[1] or 0.0))
-    shown = [[name, [percent(p), bar(p)]] for name, p in confidence if finite(p) and p >= 0.005][:5]
+    shown = [[CONFIDENCE_IN.get(name, name), [percent(p), bar(p)]] for name, p in confidence if finite(p) and p >= 0.005][:5]
     if shown:
         parts.append(table(["confidence in", ""], shown))
     return tag("div", parts, class_="numbers")
