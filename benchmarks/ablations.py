@@ -22,15 +22,18 @@ from __future__ import annotations
 
 import argparse
 import functools
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any, ClassVar
 
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 from common import Report
 from marked import heading, marked, tell
 
+import srfcli.diagnosis.verdict  # noqa: F401  with all that a diagnosis uses, for its constants
 from srfcli.codegen.model import Array
 from srfcli.core.parallel import run_processes
 from srfcli.diagnosis.scores import Remainder
@@ -71,14 +74,16 @@ class WithoutProjection(ModelSearch):
 PARTS: dict[str, type[ModelSearch]] = {"field": WithoutField, "colour": WithoutColour, "projection": WithoutProjection}
 
 
+def holding(name: str) -> list[ModuleType]:
+    """Return the modules of the diagnosis that have a constant, which is a number."""
+    own = [m for n, m in sys.modules.items() if n.startswith(("srfcli.diagnosis.", "srfcli.inference."))]
+    return [m for m in own if isinstance(getattr(m, name, None), int | float)]
+
+
 def diagnose_with(folder: Path, plugins: tuple[Path, ...], *, constant: str) -> Answer:
     """Return what the diagnosis says where a constant has another value, given as `NAME=VALUE`."""
     name, _, value = constant.partition("=")
-    import srfcli.diagnosis.verdict  # noqa: F401  all that it uses
-
-    places = [m for n, m in sys.modules.items() if n.startswith(("srfcli.diagnosis.", "srfcli.inference.")) and hasattr(m, name)]
-    if not places:
-        raise SystemExit(f"no module of the diagnosis has a constant {name}")
+    places = holding(name)
     before = getattr(places[0], name)
     try:
         for module in places:
@@ -123,6 +128,10 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--kept", type=Path, help="folder of the answers: a later run goes on there")
     given = parser.parse_args()
+    for constant in given.constants:
+        name, _, value = constant.partition("=")
+        if not holding(name) or not re.fullmatch(r"\d+(\.\d*)?", value):
+            parser.error(f"--with {constant}: give a number of srfcli.diagnosis or srfcli.inference and its value, WORTH=24")
     whole = read_answers(given.beside)
     names = sorted(whole)[: given.cases]
     names = sorted(sorted(names, key=lambda n: whole[n].cpu)[: given.quickest])

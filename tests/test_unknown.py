@@ -155,7 +155,7 @@ def test_the_command_says_it(age):
     """`unknown` comes with the force in the report and the form as an effect that the next search takes."""
     found = json.loads((age / "answer.json").read_text())
     assert found["verdict"] == "unknown"
-    assert set(sorted(found["confidence"], key=found["confidence"].get)[-2:]) == {"unknown", "missed"}
+    assert {name for name, share in found["confidence"].items() if share > 0} == {"unknown", "missed"}
     assert sum(found["confidence"].values()) == pytest.approx(1.0)
     is_the_truth(found["missing"], "age-power", {"age_power": 1.7})
     assert "latent" in found["missing"] and "age_power" in (age / "report.html").read_text()

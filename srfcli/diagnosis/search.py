@@ -625,9 +625,10 @@ class ModelSearch:
         if not gain > (WORTH if node.passes else 0.0):
             return None
         self.count += 1
-        values, other = dict(found.point.values), node.attainable + self._one_more
-        sizes, reached = (*self._sizes(node), {own[0]: values[own[0]]}), found.point.log_likelihood - node.fit.log_likelihood
-        return _Move(-(gain + other), self.count, hypothesis, values, sizes, reached=reached + other)
+        values = dict(found.point.values)
+        sizes = (*self._sizes(node), {own[0]: values[own[0]]})
+        without, reached = node.attainable + self._one_more, found.point.log_likelihood - node.fit.log_likelihood
+        return _Move(-(without + gain), self.count, hypothesis, values, sizes, reached=without + reached)
 
     def _refit_elsewhere(self, node: Fitted) -> None:
         """Fit a model that fails a test anew where a scan, or another size of what is built in, leads somewhere likelier."""

@@ -520,36 +520,34 @@ def _not_quadratic(work: _Work, best: MethodFit) -> tuple[str, ...]:
 
 def _profiles(work: _Work, best: MethodFit) -> tuple[Interval, ...]:
     """Return the interval of each parameter by the profile likelihood: each held on either side, the others fitted again."""
-    scale, top, found = work.matcher.scale, best.match.y, []
-    everything = np.ones(len(work.matcher.table), dtype=bool)
-    for k, q in enumerate(scale):
-        error, along = _ridge(scale, best, k)
-        others, ends, before, refits = np.arange(len(scale)) != k, [], len(work.trace), Refits()
-        for side, bound in zip((-1.0, 1.0), scale.bounds, strict=True):
-            last = top
-
-            def deviance(
-                distance: float,
-                k: int = k,
-                side: float = side,
-                along: Array = along,
-                others: Array = others,
-                refits: Refits = refits,
-            ) -> float:
-                nonlocal last
-                start = last + along * (top[k] + side * distance - last[k])
-                start[k] = top[k] + side * distance
-                work.best = None
-                with suppress(_Stop):  # where nothing is left to minimise
-                    _trust_region(work, start, everything, others)
-                assert work.best is not None
-                last = work.best.y
-                return refits.met(work.best.cost - best.cost, dict(zip(scale.names, scale.values(last).tolist(), strict=True)))
-
-            distance = interval_end(deviance, error, float(abs(bound[k] - top[k])))
-            ends.append(None if distance is None else q.value(float(top[k] + side * distance)))
-        found.append(Interval(q.name, ends[0], ends[1], len(work.trace) - before, refits.gain, refits.likelier))
+    found = []
+    for k, q in enumerate(work.matcher.scale):
+        before, refits = len(work.trace), Refits()
+        low, high = (_end(work, best, k, side, refits) for side in (-1.0, 1.0))
+        found.append(Interval(q.name, low, high, len(work.trace) - before, refits.gain, refits.likelier))
     return tuple(found)
+
+
+def _end(work: _Work, best: MethodFit, k: int, side: float, refits: Refits) -> float | None:
+    """Return where the profile of coordinate k crosses CHI2_95 on one side."""
+    scale, top = work.matcher.scale, best.match.y
+    error, along = _ridge(scale, best, k)
+    others, everything, last = np.arange(len(scale)) != k, np.ones(len(work.matcher.table), dtype=bool), top
+
+    def deviance(distance: float) -> float:
+        nonlocal last
+        start = last + along * (top[k] + side * distance - last[k])
+        start[k] = top[k] + side * distance
+        work.best = None
+        with suppress(_Stop):  # where nothing is left to minimise
+            _trust_region(work, start, everything, others)
+        assert work.best is not None
+        last = work.best.y
+        return refits.met(work.best.cost - best.cost, dict(zip(scale.names, scale.values(last).tolist(), strict=True)))
+
+    bound = scale.bounds[0 if side < 0 else 1]
+    distance = interval_end(deviance, error, float(abs(bound[k] - top[k])))
+    return None if distance is None else list(scale)[k].value(float(top[k] + side * distance))
 
 
 def _run(matcher: Matcher, method: str, limit: int, report: Report | None) -> MethodFit:

@@ -465,7 +465,7 @@ def said_likelier(intervals: Sequence[Interval], shown: Callable[[str, float], t
     units, numbers = zip(*(shown(name, value) for name, value in best.likelier.items()), strict=True)
     values = ", ".join(with_unit(f"{n} = {x:.5g}", u) for n, (x,), u in zip(best.likelier, numbers, units, strict=True))
     where = f"a refit beside the fit, in the profile of {best.name}, is likelier by {best.gain:.2g} in log likelihood: {values}"
-    return [f"{where}. The fit has ended at a local maximum, and intervals are about that: begin at these values"]
+    return [f"{where}. The fit has not ended at the highest maximum, and intervals are about its own: begin at these values"]
 
 
 def load_notes(fit: Fit) -> list[str]:
