@@ -52,25 +52,12 @@ _POINTERS = ("x", "p", "_w", "_a")  # arguments that are vectors
 _OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 _PI = "3.14159265358979323846"
 
-_DUAL_OPERATORS = {
-    ast.Add: "srf_add", ast.Sub: "srf_sub", ast.Mult: "srf_mul", ast.Div: "srf_div", ast.Pow: "srf_pow",
+_SLOPES = {  # of f at {a} where f({a}) = {v}
+    "cos": "-sin({a})", "cosh": "sinh({a})", "exp": "{v}", "expm1": "({v} + 1.0)", "log": "1.0 / {a}",
+    "log1p": "1.0 / (1.0 + {a})", "sin": "cos({a})", "sinh": "cosh({a})", "sqrt": "0.5 / {v}", "tan": "(1.0 + {v} * {v})",
+    "tanh": "(1.0 - {v} * {v})", "atan": "1.0 / (1.0 + {a} * {a})", "asinh": "1.0 / sqrt(1.0 + {a} * {a})",
+    "srf_lambertw": "1.0 / (exp({v}) * (1.0 + {v}))",
 }  # fmt: skip
-_SLOPES = {  # of f at x where f(x) = v
-    "cos": "-sin(a.v)", "cosh": "sinh(a.v)", "exp": "v", "expm1": "v + 1.0", "log": "1.0 / a.v",
-    "log1p": "1.0 / (1.0 + a.v)", "sin": "cos(a.v)", "sinh": "cosh(a.v)", "sqrt": "0.5 / v", "tan": "1.0 + v * v",
-    "tanh": "1.0 - v * v", "atan": "1.0 / (1.0 + a.v * a.v)", "asinh": "1.0 / sqrt(1.0 + a.v * a.v)",
-    "srf_lambertw": "1.0 / (exp(v) * (1.0 + v))",
-}  # fmt: skip
-
-
-def _functions_of_duals(source: str) -> str:
-    """Return the C text of the functions of dual numbers that a generated module calls."""
-    text = ""
-    for name, known in _FUNCTIONS.items():
-        if known in _SLOPES and f"{name}(" in source:
-            body = f"double v = {known}(a.v); return srf_scaled(v, {_SLOPES[known]}, a);"
-            text += f"static inline dual d_{known}(dual a) {{ {body} }}\n"
-    return text
 
 
 def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str:
@@ -83,26 +70,25 @@ def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str
     if function is None:
         raise SrfError(f"generated module has no function '{name}'")
     arguments = [a.arg for a in function.args.args]
-    duals = {a for a in arguments if a in ("x", "p")} if dual else None
+    slopes = _Slopes() if dual else None
     lines, shape = [], (1,)
     for statement in function.body[1:]:  # the first is the docstring
         if isinstance(statement, ast.Return):
             if isinstance(statement.value, ast.BinOp):  # of one number: _empty(...) + it
-                lines.append(f"out[0] = {_value(statement.value.right, duals)};")
+                lines += _stored(0, statement.value.right, slopes)
             continue
         assert isinstance(statement, ast.Assign)
         target, value = statement.targets[0], statement.value
         if isinstance(target, ast.Subscript):
-            lines.append(f"out[{_flat(target, shape)}] = {_value(value, duals)};")
+            lines += _stored(_flat(target, shape), value, slopes)
         elif isinstance(target, ast.Name) and target.id == "out":
             assert isinstance(value, ast.Call)
             shape = ast.literal_eval(value.args[1])
         elif isinstance(target, ast.Name):
-            if duals is not None and _Dual(duals).moves(value):
-                duals.add(target.id)
-                lines.append(f"const dual {_safe(target.id)} = {_Dual(duals).text(value)};")
-            else:
+            if slopes is None or not slopes.moves(value):
                 lines.append(f"const double {_safe(target.id)} = {_text(value)};")
+            else:
+                lines += slopes.named(target.id, value)
     unused = "".join(f" (void){_safe(a)};" for a in arguments)
     kinds = {a: "const dual *" if dual else "const double *" for a in _POINTERS}
     declared = ", ".join(f"{kinds.get(a, 'const double ')}{_safe(a)}" for a in arguments)
@@ -116,52 +102,132 @@ def _functions(source: str) -> dict[str, ast.FunctionDef]:
     return {d.name: d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef)}
 
 
-def _value(node: ast.AST, duals: set[str] | None) -> str:
-    if duals is None:
-        return _text(node)
-    own = _Dual(duals)
-    return own.text(node) if own.moves(node) else f"srf_plain({_text(node)})"
+def _stored(place: int, node: ast.AST, slopes: _Slopes | None) -> list[str]:
+    """Return the lines that put an expression into an entry of `out`."""
+    if slopes is None:
+        return [f"out[{place}] = {_text(node)};"]
+    if not slopes.moves(node):
+        return [f"out[{place}] = srf_plain({_text(node)});"]
+    lines, value, along = slopes.of(node)
+    return [*lines, f"out[{place}].v = {value};", *_along(f"out[{place}].d", along)]
 
 
-class _Dual:
-    """Text of expressions in dual numbers; what depends on none of the `names` stays a plain number."""
+def _along(target: str, terms: Sequence[tuple[str, str]]) -> list[str]:
+    """Return the calls that give `target` the sum of terms (partial derivative, what has the derivatives), three at a time."""
+    lines, rest = [], list(terms)
+    while rest:
+        some, rest = rest[:3], rest[3:]
+        lines.append(f"srf_along_{len(some)}(&{target}, {', '.join(f'{by}, &{of}' for by, of in some)});")
+        rest = [("1.0", target), *rest] if rest else []
+    return lines
 
-    def __init__(self, names: set[str]) -> None:
-        self.names = names
+
+class _Slopes:
+    """Text of expressions and of their derivatives along a function's steps.
+
+    The partial derivatives of a step by what it is computed from are plain numbers, found backwards through its formula; the
+    derivatives that are carried along are combined once a step (preaccumulation; Griewank and Walther 2008). What depends on
+    neither x nor p has none.
+    """
+
+    def __init__(self) -> None:
+        self._moved: dict[str, str] = {}  # what has the derivatives of a name
+        self._lines: list[str] = []
+        self._values: dict[int, str] = {}  # of subexpressions, by node
+        self._partials: dict[str, list[str]] = {}  # of the expression at hand, by what has the derivatives
+        self._count = 0
 
     def moves(self, node: ast.AST) -> bool:
         """Return whether an expression has derivatives."""
-        return any(isinstance(n, ast.Name) and n.id in self.names for n in ast.walk(node))
+        return any(isinstance(n, ast.Name) and (n.id in self._moved or n.id in ("x", "p")) for n in ast.walk(node))
 
-    def text(self, node: ast.AST) -> str:
-        """Return an expression that moves, as C."""
-        if isinstance(node, ast.UnaryOp):
-            inner = self.text(node.operand)
-            return f"srf_mul_c({inner}, -1.0)" if isinstance(node.op, ast.USub) else inner
-        if isinstance(node, ast.BinOp):
-            return self._binary(node)
-        if isinstance(node, ast.Call):
-            assert isinstance(node.func, ast.Name)
-            if _FUNCTIONS.get(node.func.id) not in _SLOPES:
-                raise SrfError(f"function {node.func.id} of a generated module has no derivative in C")
-            return f"d_{_FUNCTIONS[node.func.id]}({self.text(node.args[0])})"
-        return _text(node)
+    def named(self, name: str, node: ast.AST) -> list[str]:
+        """Return the lines that give `name` to an expression that moves."""
+        lines, value, along = self.of(node)
+        lines.append(f"const double {_safe(name)} = {value};")
+        if len(along) == 1 and along[0][0] == "1.0":
+            self._moved[name] = along[0][1]
+            return lines
+        own = self._moved[name] = f"d_{name}"
+        return [*lines, f"lanes {own};", *_along(own, along)]
 
-    def _binary(self, node: ast.BinOp) -> str:
-        moving = self.moves(node.left), self.moves(node.right)
-        left, right = (self.text(n) if m else _text(n) for n, m in zip((node.left, node.right), moving, strict=True))
-        kind = type(node.op)
-        if all(moving):
-            return f"{_DUAL_OPERATORS[kind]}({left}, {right})"
-        if kind is ast.Pow:
-            return f"srf_pow_c({left}, {right})" if moving[0] else f"srf_c_pow({left}, {right})"
-        if moving[0]:
-            forms = {ast.Add: "srf_add_c({}, {})", ast.Sub: "srf_add_c({}, -({}))", ast.Mult: "srf_mul_c({}, {})"}
-            return forms.get(kind, "srf_mul_c({}, 1.0 / ({}))").format(left, right)
-        if kind is ast.Sub:
-            return f"srf_add_c(srf_mul_c({right}, -1.0), {left})"
-        forms = {ast.Add: "srf_add_c({1}, {0})", ast.Mult: "srf_mul_c({1}, {0})", ast.Div: "srf_c_div({0}, {1})"}
-        return forms[kind].format(left, right)
+    def of(self, node: ast.AST) -> tuple[list[str], str, list[tuple[str, str]]]:
+        """Return the lines before it, the value of an expression that moves, and by which derivatives of what its own are."""
+        self._lines, self._values, self._partials = [], {}, {}
+        value = self._value(node)
+        self._back(node, "1.0")
+        return self._lines, value, [(" + ".join(by), of) for of, by in self._partials.items()]
+
+    def _let(self, text: str) -> str:
+        self._count += 1
+        self._lines.append(f"const double t{self._count} = {text};")
+        return f"t{self._count}"
+
+    def _value(self, node: ast.AST) -> str:
+        """Return an expression's value, that of what moves in it named, as its derivative asks for it."""
+        if not self.moves(node):
+            return _text(node)
+        match node:
+            case ast.Subscript():
+                found = f"{_text(node)}.v"
+            case ast.UnaryOp(op=op, operand=operand):
+                found = f"(-{self._value(operand)})" if isinstance(op, ast.USub) else self._value(operand)
+            case ast.BinOp(left=left, right=ast.Constant(value=2), op=ast.Pow()):
+                inner = self._value(left)
+                found = self._let(f"{inner} * {inner}")
+            case ast.BinOp(left=left, right=right, op=ast.Pow()):
+                found = self._let(f"pow({self._value(left)}, {self._value(right)})")
+            case ast.BinOp(left=left, right=right, op=op):
+                found = self._let(f"{self._value(left)} {_OPERATORS[type(op)]} {self._value(right)}")
+            case ast.Call(func=ast.Name(id=name), args=[inner]) if _FUNCTIONS.get(name) in _SLOPES:
+                found = self._let(f"{_FUNCTIONS[name]}({self._value(inner)})")
+            case ast.Call(func=ast.Name(id=name)):
+                raise SrfError(f"function {name} of a generated module has no derivative in C")
+            case _:
+                found = _text(node)
+        self._values[id(node)] = found
+        return found
+
+    def _back(self, node: ast.AST, by: str) -> None:
+        """Add to the partial derivatives those of an expression by which the whole has the derivative `by`."""
+        if not self.moves(node):
+            return
+        match node:
+            case ast.Subscript():
+                self._partials.setdefault(f"{_text(node)}.d", []).append(by)
+            case ast.Name(id=name):
+                self._partials.setdefault(self._moved[name], []).append(by)
+            case ast.UnaryOp(op=op, operand=operand):
+                self._back(operand, f"(-{by})" if isinstance(op, ast.USub) else by)
+            case ast.Call(func=ast.Name(id=name), args=[inner]):
+                slope = _SLOPES[_FUNCTIONS[name]].format(a=self._plain(inner), v=self._plain(node))
+                self._back(inner, self._times(by, slope))
+            case ast.BinOp(left=left, right=right, op=op):
+                a, b, v = self._plain(left), self._plain(right), self._plain(node)
+                if isinstance(op, ast.Add | ast.Sub):
+                    self._back(left, by)
+                    self._back(right, by if isinstance(op, ast.Add) else f"(-{by})")
+                elif isinstance(op, ast.Mult):
+                    for side, other in ((left, b), (right, a)):
+                        if self.moves(side):
+                            self._back(side, self._times(by, other))
+                elif isinstance(op, ast.Div):
+                    over = self._let(f"{by} / {b}")
+                    self._back(left, over)
+                    if self.moves(right):
+                        self._back(right, self._let(f"-{v} * {over}"))
+                else:
+                    if self.moves(left):
+                        square = isinstance(right, ast.Constant) and right.value == 2
+                        self._back(left, self._times(by, f"2.0 * {a}" if square else f"{b} * pow({a}, {b} - 1.0)"))
+                    if self.moves(right):
+                        self._back(right, self._times(by, f"{v} * log({a})"))
+
+    def _plain(self, node: ast.AST) -> str:
+        return self._values[id(node)] if self.moves(node) else _text(node)
+
+    def _times(self, by: str, factor: str) -> str:
+        return self._let(f"{by} * {factor}") if by != "1.0" else factor if factor.isidentifier() else self._let(factor)
 
 
 def _flat(target: ast.Subscript, shape: tuple[int, ...]) -> int:
@@ -259,7 +325,7 @@ def filter_source(model: GeneratedModel) -> CText:
     """Return the C text of the filter for a model with a random friction field."""
     sizes = _defined({"LANES": LANES, "GAUGE_PROCESSES": GAUGE_PROCESSES, "SIGNALS": SIGNALS})
     text = _step_source(model, {n: FUNCTIONS[n] for n in ("rates", "rates_jacobian")} | {"field_gain": "srf_gain"})
-    text += sizes + _own("dual.c") + _functions_of_duals(model.source)
+    text += sizes + _own("dual.c")
     for name, label in DUAL_FUNCTIONS.items():  # the spring as it is may be what the gauge shows
         known = name if name in model.namespace else name.replace("spring", "reading")
         text += c_function(model.source, known, label=label, dual=True)

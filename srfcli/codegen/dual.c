@@ -6,17 +6,10 @@ static inline dual srf_add(dual a, dual b) { dual r = {a.v + b.v, a.d + b.d}; re
 static inline dual srf_sub(dual a, dual b) { dual r = {a.v - b.v, a.d - b.d}; return r; }
 static inline dual srf_mul(dual a, dual b) { dual r = {a.v * b.v, a.v * b.d + b.v * a.d}; return r; }
 static inline dual srf_div(dual a, dual b) { double i = 1.0 / b.v, q = a.v * i; dual r = {q, i * (a.d - q * b.d)}; return r; }
-static inline dual srf_add_c(dual a, double b) { a.v += b; return a; }
 static inline dual srf_mul_c(dual a, double b) { return srf_scaled(a.v * b, b, a); }
-static inline dual srf_c_div(double a, dual b) { double q = a / b.v; return srf_scaled(q, -q / b.v, b); }
-static inline dual srf_pow_c(dual a, double b) {
-    if (b == 2.0) return srf_scaled(a.v * a.v, 2.0 * a.v, a);
-    double q = pow(a.v, b - 1.0);
-    return srf_scaled(q * a.v, b * q, a);
+/* derivatives of a step of a model from those of what it is computed from; called, as inlined they take most of the compiler's time */
+static NOINLINE void srf_along_1(lanes *out, double p, const lanes *a) { *out = p * *a; }
+static NOINLINE void srf_along_2(lanes *out, double p, const lanes *a, double q, const lanes *b) { *out = p * *a + q * *b; }
+static NOINLINE void srf_along_3(lanes *out, double p, const lanes *a, double q, const lanes *b, double r, const lanes *c) {
+    *out = p * *a + q * *b + r * *c;
 }
-static inline dual srf_pow(dual a, dual b) {
-    double q = pow(a.v, b.v);
-    dual r = {q, q * (b.v / a.v * a.d + log(a.v) * b.d)};
-    return r;
-}
-static inline dual srf_c_pow(double a, dual b) { double q = pow(a, b.v); return srf_scaled(q, q * log(a), b); }
