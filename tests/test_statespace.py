@@ -170,6 +170,33 @@ def test_derivatives_are_those_of_the_likelihood(rig):
     assert max(worst.values()) < 1e-3, worst  # stick-slip is the worst, and there the differences are
 
 
+def test_derivatives_of_every_function_that_a_law_may_have(tmp_path, make_model):
+    """One law with all of them, by a number that stands inside and before each."""
+    x, functions = "log(v/V0)", ("exp", "log1p", "expm1", "sin", "cos", "sinh", "cosh", "tanh", "asinh", "atan")
+    terms = [f"c*{f}(c*{x} + {i + 1}/10)" for i, f in enumerate(functions)]
+    terms += [f"c*sqrt(1 + {x}**2)", f"c*lambertw(1 + c*{x}**2)", "c*(v/V0)**c", "c*c**(c*phi*V0/D0)", "c*(1 + phi*V0/D0)**(1/3)"]
+    values = {"mu0": 0.3, "A": 0.02, "B": 0.01, "c": 0.1, "D0": 0.4}
+    lines = [
+        f'{n} = {{ default = {v}, unit = "{"um" if n == "D0" else "1"}", about = "of the test" }}' for n, v in values.items()
+    ]
+    lines.append('V0 = { default = 1.0, unit = "um/s", about = "of the test" }')
+    law = tmp_path / "all.toml"
+    law.write_text(
+        'format = "srf-law/1"\nkind = "friction"\nname = "all"\nabout = "Every function"\n'
+        f'mu = "mu0 + A*log(v/V0) + B*log(1 + phi*V0/D0) + {" + ".join(terms)}"\n[parameters]\n' + "\n".join(lines)
+    )
+    run = recording(np.linspace(0, 0.8, 81), "elongation", STEPS, ConstantLoad(5.0))
+    own = Rig(PMMA | {"law": str(law)}, values, run, "0.21 N/um", 2.37e-6)
+    model = make_model(**own.choice, random_field=True)
+
+    def innovations(c: float) -> Any:
+        known = values | FIELD | {"gauge_white": 0.01, "c": c}
+        return filter_run(model, own.experiment, run, known, by=["c"], rtol=1e-9).found
+
+    difference = (innovations(0.1001).nu - innovations(0.0999).nu) / 0.0002
+    assert np.abs(innovations(0.1).nu_d[:, 0] - difference).max() < 1e-5 * np.abs(difference).max()
+
+
 def test_gauge_noise_has_the_density_of_its_covariance(make_model):
     """Two sampling rates with a noise each: smooth, two relaxations in one, and a line; readings are missing. Dense algebra."""
     model, own = make_model(**ROCK, random_field=True), RIGS["rock, free start and trend"]
