@@ -31,7 +31,7 @@ LONG = (
     "test_unknown.py", "test_api.py", "test_fit.py", "test_observables.py", "test_fit_rough.py", "test_notebooks.py",
     "test_diagnose_command.py", "test_hostile_files.py", "test_report.py", "test_stress.py", "test_check.py",
     "test_cli_commands.py", "test_recording_flaws.py", "test_simulate_command.py", "test_load_oscillations.py",
-    "test_statespace.py", "test_equations.py", "test_cache.py", "test_report_browser.py", "test_site.py", "test_compare.py",
+    "test_statespace.py", "test_equations.py", "test_cache.py", "test_site.py", "test_compare.py",
     "test_one_run.py", "test_sample.py", "test_derive.py", "test_thresholds.py", "test_brute_force.py", "test_generate.py",
     "test_campaign.py", "test_motion.py", "test_kills.py", "test_effect_plugins.py", "test_escapes.py", "test_parallel.py",
     "test_paper.py", "test_readers.py", "test_packaging.py", "test_without_compiler.py",

@@ -24,7 +24,7 @@ from srfcli.codegen.numpy_source import generate
 from srfcli.laws.registry import bundled_registry
 from srfcli.symbolic.system import build_system
 
-for names in ({}, {"ageing": "kato-tullis", "interface": "rigid", "loading": "inclined"}):
+for names in ({}, {"law": "dieterich-ruina", "ageing": "ruina", "interface": "rigid", "loading": "inclined", "inertia": False}):
     system = build_system(bundled_registry(), **names)
     text = generate(system) + render.to_latex(system, derivation(system, ())) + render.to_python(system)
     print(hashlib.sha256(text.encode()).hexdigest())

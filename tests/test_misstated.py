@@ -146,7 +146,7 @@ def test_what_another_ageing_law_has_of_its_own_is_fitted(tmp_path: Path) -> Non
 
 def test_a_declared_modulation_counts_between_samples_that_are_too_few_for_it(tmp_path: Path) -> None:
     """At 200 Hz a load of 120 Hz looks like one of 80 Hz: the column agrees with both, and the spline through it with none."""
-    rig = ("--law", "srf-vsat", "--K", "0.21 N/um", "--W0", 7, "--eps", 0.15, "--onset", 1, "--drive", "4:8,2:16")
+    rig = ("--law", "srf-vsat", "--K", "0.21 N/um", "--W0", 7, "--eps", 0.15, "--onset", 0.5, "--drive", "2:8,1:16")
     srf("simulate", *rig, "--rate", 200, "--noise", 0.05, "--seed", 3, "--free", "A,B,D0", "--out-dir", tmp_path / "run")
     fitted = json.loads(srf("fit", tmp_path / "run", "--json").stdout)
     assert fitted["status"] == "ok"

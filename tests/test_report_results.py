@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
-from test_report import Page
-from test_report_browser import BROWSER, WIDTHS, laid_out
+from test_report import BROWSER, WIDTHS, Page, laid_out
 
 from srfcli.cli.main import cli
 
