@@ -114,6 +114,26 @@ def test_a_record_that_begins_with_a_hold_is_fitted(tmp_path: Path) -> None:
         assert abs(values[name][0] - true) < 4 * values[name][1] < 0.2 * true, name
 
 
+def test_a_line_that_coloured_noise_hides_at_one_lag_is_found(tmp_path: Path) -> None:
+    """The correlation at one sample is that of white noise, as noise over 0.2 s and a line of 3.1 Hz undo each other there."""
+    description = record(tmp_path / "run", drive="40:4,40:12,40:4")
+    heading, *lines = (tmp_path / "run" / "simulated.csv").read_text().splitlines()
+    column = next(i for i, name in enumerate(heading.split(",")) if name.startswith("force"))
+    rows, rng = np.array([line.split(",") for line in lines], dtype=float), np.random.default_rng(4)
+    slow = np.zeros(len(rows))
+    for i in range(1, slow.size):
+        slow[i] = 0.6 * slow[i - 1] + 0.8 * 0.01 * rng.standard_normal()
+    noise = slow + 0.014 * np.sqrt(2) * np.sin(2 * np.pi * 3.1 * rows[:, 0])
+    assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.1
+    rows[:, column] += noise
+    (tmp_path / "run" / "simulated.csv").write_text("\n".join([heading, *(",".join(map(repr, r)) for r in rows.tolist())]) + "\n")
+    fitted = json.loads(srf("fit", description, "--json").stdout)
+    ((_, found),) = fitted["meta"]["noise"].items()
+    colours = found["colours"]
+    frequency, size, _ = next(c for c in colours if len(c) == 3)
+    assert frequency == pytest.approx(3.1, rel=0.03) and 0.004 < size < 0.03
+
+
 def test_friction_that_drifts_with_slip_is_no_slow_field(tmp_path: Path) -> None:
     """Of two variants of one effect both are fitted, and from no wider field than promised them."""
     made = ("--effect", "friction-drift-slip", "--set", "rate=2e-5", "--set", "onset=0")

@@ -1536,11 +1536,13 @@ def with_less_colour(found: StateSpaceFit, close: float, progress: Callable[[str
 
 
 def correlated(point: Point) -> float:
-    """Return how far the innovations are correlated with exponential means of those before, in standard deviations, at most.
+    """Return how far the innovations are correlated with those before, in standard deviations, at most.
 
-    That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of a run.
+    With exponential means of them, which is the score test of gauge noise with one more correlation time, over times from one
+    sample to a tenth of a run; and at the first LAGS lags together, where an oscillation shows that such means miss.
     """
-    worst, longest = 0.0, max((white.size for f in point.runs for white in f.parts), default=0)
+    worst = lag_correlations([white for f in point.runs for white in f.parts])
+    longest = max((white.size for f in point.runs for white in f.parts), default=0)
     for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
         product, square = 0.0, 0.0
         for white in (np.clip(w, -5.0, 5.0) for f in point.runs for w in f.parts):
@@ -1605,10 +1607,22 @@ def _shown(found: StateSpaceFit, kind: Kind, frequency: float) -> bool:
 
 def portmanteau(white: Array) -> float:
     """Return how far the correlations at the first LAGS lags are from those of white noise: Ljung and Box's Q, standardised."""
+    return (_ljung_box(white) - LAGS) / np.sqrt(2 * LAGS)
+
+
+def lag_correlations(parts: Sequence[Array]) -> float:
+    """Return the same of all parts together as a normal deviate (Wilson and Hilferty 1931); those of few readings aside."""
+    long = [white for white in parts if white.size > 5 * LAGS]
+    if not long:
+        return 0.0
+    spread = 2 / (9 * LAGS * len(long))
+    return float((np.cbrt(sum(map(_ljung_box, long)) / (LAGS * len(long))) - (1 - spread)) / np.sqrt(spread))
+
+
+def _ljung_box(white: Array) -> float:
     n, c = white.size, np.clip(white, -5.0, 5.0)
     square = float(c @ c)
-    Q = sum(n * (n + 2) / (n - k) * (float(c[k:] @ c[:-k]) / square) ** 2 for k in range(1, LAGS + 1)) if square else 0.0
-    return (Q - LAGS) / np.sqrt(2 * LAGS)
+    return sum(n * (n + 2) / (n - k) * (float(c[k:] @ c[:-k]) / square) ** 2 for k in range(1, LAGS + 1)) if square else 0.0
 
 
 def cut(white: Array) -> list[Array]:

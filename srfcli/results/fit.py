@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 PARAMETERS = (
     Column("parameter", "", "name"),
     Column("value", "", "estimate, in the unit beside it"),
-    Column("stderr", "", "standard error; coloured noise allowed for", ".3g"),
+    Column("stderr", "", "standard error; coloured noise allowed for; none at a bound", ".3g"),
     Column("low", "", "lower end of the 95 % interval"),
     Column("high", "", "upper end of the 95 % interval"),
     Column("unit", "", "unit of all the columns before"),
@@ -227,7 +227,8 @@ class FitResult(Result):
         profiled = {i.name: i for i in self.intervals}
         rows = []
         for k, name in enumerate(fit.names):
-            value, error, interval = fit.values[name], fit.stderr[name], profiled.get(name)
+            value, interval = fit.values[name], profiled.get(name)
+            error = fit.stderr[name] or math.nan  # none at a bound
             ends = (value - 1.96 * error, value + 1.96 * error) if interval is None else (interval.low, interval.high)
             unit, (*shown, start) = self._shown(name, value, error, *ends, float(found.problem.start[k]))
             rows.append((name, *shown, unit, start, flag(fit, k)))
