@@ -84,7 +84,7 @@ FORMS = {
     "words": (["Elapsed (s)", "Stroke (mm)", "Friction [uN]", "Fz [mN]"], (1, 1e-3, SIGMA * 1e6, 1e3), "txmS", "40 N/mm"),
     "rotary": (["time [s]", "Angle [deg]", "Torque [N m]", "Axial load [N]"], (1, DEGREES, SIGMA * 0.025, 1), "txmS", "40 N/mm"),
     "strain": (["time [s]", "Shear strain", "Shear traction [MPa]", "eff. normal stress [MPa]"], (1, 1 / 4000, SIGMA, 1), "txmS",
-               "40 MPa/mm"),
+               "160 MPa"),
     "compression": (["X_Value", "lp_disp_um", "Shr_stress_MPa", "nor_stress_MPa"], (1, 1, SIGMA, -1), "txmS", "40 MPa/mm"),
     "area": (["time [s]", "Angular speed [rpm]", "Torque [mN m]", "Fn [N]"], (1, DEGREES / 6, SIGMA * 50 * 25, 50), "tVmS",
              "1250 N m/rad"),

@@ -100,6 +100,10 @@ def load_smoothed(c: Columns) -> None:
     c.W += 0.5 * np.sin(c.t) + c.random.normal(0, 0.01, N)
 
 
+def load_steps(c: Columns) -> None:
+    c.W = np.where(c.t < 6, 5.0, 5.5)
+
+
 def modulation_differs(c: Columns) -> None:
     c.W *= 1 + 0.08 * np.cos(2 * np.pi * 5 * c.t)
     c.toml += "modulation = { frequency = 5.0, amplitude = 0.16 }\n"
@@ -160,6 +164,7 @@ FLAWS: dict[str, tuple[Callable[[Columns], None], str]] = {
     "quantisation": (quantisation, "one.csv: column 'spring': steps of 0.05, "),
     "load-constant": (load_constant, "constant to its noise of 0.0021 of 5.0"),
     "load-smoothed": (load_smoothed, "which dW/dt would amplify: smoothed by a spline"),
+    "load-steps": (load_steps, "from 5 to 5.5 N after t = 5.99 s, the load point moves by 0.08 um, "),
     "modulation-differs": (modulation_differs, "relative amplitude declared 0.16, found 0.08; the column counts"),
     "drive-differs": (drive_differs, "600 of 1200 velocities differ from the declared drive by more than 5 %, the first 8"),
     "drive-segmented": (drive_segmented, "2 constant or straight pieces describe them"),

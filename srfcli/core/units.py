@@ -132,7 +132,8 @@ def unit_factor(written: str, unit: str, geometry: Geometry = NO_GEOMETRY, *, wh
     """Return what a number in `written` is multiplied by to be in `unit`; raises SrfError, beginning with `where`.
 
     A stress counts as the force on 1 mm^2, so that 1 MPa is 1 N and 1 MPa/mm is 1e-3 N/um. With its radius a torque is a force
-    and an angle a length, with its thickness a strain is a length, and with its area a force is a stress.
+    and an angle a length, with its thickness a strain is a length and a stress per strain a stiffness, and with its
+    area a force is a stress.
     """
     found, wanted = find_unit(written, where=where), find_unit(unit)
     factor = factor_between(found, wanted)
@@ -149,9 +150,9 @@ def unit_factor(written: str, unit: str, geometry: Geometry = NO_GEOMETRY, *, wh
                 return ratio * geometry.radius**turns / (geometry.area or 1.0 if wanted.powers[2] else 1.0)
             hint = f'A rotary rig needs its radius, from which {unit} follow: [apparatus] radius = "25 mm"'
             kind = "unit"
-        elif gap == (1, 0, 0, 0) and found.powers[2] == 0:  # a strain for a length
-            if geometry.thickness:
-                return ratio * geometry.thickness
+        elif gap == (1, 0, 0, 0) and (found.powers[2] == 0 or wanted.powers == (-1, 0, 1, 0)):  # a strain for a length
+            if geometry.thickness:  # a stress per strain is a stiffness
+                return ratio * (SQUARE_MILLIMETRE / geometry.thickness if found.powers[2] else geometry.thickness)
             hint = f'A strain needs the layer\'s thickness, from which {unit} follow: [apparatus] thickness = "4 mm"'
             kind = "unit"
     prefix = f"{where}: " if where else ""

@@ -207,7 +207,8 @@ def _apparatus(node: Node) -> Apparatus:
         mass.fail("a mass beside an area, with which forces count as stresses", "Leave one of the two out.")
     plain = not is_stress(unit) and (per_load or find_unit(unit).powers == (-1, 0, 1, 0)) and not geometry.area
     text = stiffness.value if plain else f"{value!r} {base}"  # nothing below this knows of stresses and of geometry
-    stated = "MPa/um" if geometry.area and not per_load else unit if plain or is_stress(unit) else base
+    by_strain = is_stress(unit) and same_dimension(unit, "MPa")
+    stated = "MPa/um" if by_strain or (geometry.area and not per_load) else unit if plain or is_stress(unit) else base
     return Apparatus(value, per_load, text, stated, kilograms * 1e-6 if kilograms else None, geometry)
 
 

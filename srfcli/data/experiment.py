@@ -312,6 +312,8 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
     )  # fmt: skip
     if run.drive is None and columns.role("load_point_velocity") is not None:
         read = replace(read, notices=(*read.notices, *_late_steps(read, columns.place("load_point_velocity").column)))
+    if run.modulation is None and (recorded_load := columns.role(*LOADS)) is not None:
+        read = replace(read, notices=(*read.notices, *_load_steps(read, columns.place(recorded_load).column)))
     friction = float(np.median(read.friction[used])) if used.any() else 1.0
     if LEAST_FRICTION < abs(friction) < LARGEST_FRICTION:
         return read
@@ -335,6 +337,24 @@ def _late_steps(run: Run, where: str) -> list[Notice]:
         f"{interval:.3g} s earlier, {late[k]:.3g} um of the load point and {shown[k] / noise:.0f} times the noise"
     )
     return [Notice("drive-steps", where, what)]
+
+
+def _load_steps(run: Run, where: str) -> list[Notice]:
+    """Return a notice where a load steps between two samples, and the drive moves on by more than the noise meanwhile."""
+    W, path = run.load(run.t)[0], np.abs(run.drive(run.t[:-1])) * np.diff(run.t)
+    rise = np.pad(np.abs(np.diff(W)), 1)
+    alone = (rise[1:-1] > LOAD_STEP * W[:-1]) & (rise[1:-1] > LOAD_STEP_SHARE * (rise[:-2] + rise[1:-1] + rise[2:]))
+    shown = np.where(alone, path * per_elongation(run.observable, run.stiffness, run.first_load), 0.0)
+    noise = white_level(run.observed[run.used])
+    if not shown.size or not shown.max() > noise > 0:
+        return []
+    k = int(np.argmax(shown))
+    step = f"from {W[k]:.4g} to {W[k + 1]:.4g} {run.load_unit} after t = {run.t[k]:.6g} s"
+    what = (
+        f"the load is taken to change evenly between samples; as it steps, {step}, the load point moves by {path[k]:.3g} um, "
+        f"{shown[k] / noise:.2g} times the noise: a faster step shifts alpha, A and D0"
+    )
+    return [Notice("load-steps", where, what)]
 
 
 def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
@@ -420,6 +440,7 @@ def clean_observable(
 
 # The check of a recording: sampling, flaws, noise, and the history of drive and load, as found in the data.
 
+LOAD_STEP, LOAD_STEP_SHARE = 0.01, 0.8  # of the load; of what it changes by with the intervals beside
 LATE = 10.0  # times the noise of what is observed, from where it is told that a step of the drive may have been between samples
 LEAST_FRICTION, LARGEST_FRICTION = 0.01, 3.0  # that surfaces which slide in contact have
 NOTICE_KINDS = {  # of notices, as --fail-on takes them
@@ -434,6 +455,7 @@ NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "quantisation": "steps of the gauge that are not small against its noise",
     "load-constant": "a load that varies no more than its noise",
     "load-smoothed": "a load that was smoothed",
+    "load-steps": "a step of the load between two samples, whose course would show",
     "modulation-differs": "the load is not modulated as declared",
     "drive-differs": "the column of velocities is not the declared drive",
     "drive-segmented": "a drive found in noisy velocities",

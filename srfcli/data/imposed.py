@@ -633,6 +633,7 @@ def _step(t: Array, x: Array, sigma: Array, knots: Array, heights: Array, dampin
 
 LOADS = ("normal_load", "normal_stress")
 NEGLIGIBLE = 1e-5  # of the load's range: noise below it is interpolated and not smoothed
+SELDOM = 100  # samples to each that differs from the one before, from which a load was set, and what is between has no noise
 BLOCKS = 16  # whose means are compared to see whether a load is constant
 ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
 NO_CONTACT = 1e-15  # N: no contact
@@ -721,7 +722,7 @@ def _smooth(place: Place, W: Array, unit: str) -> tuple[Load, list[Notice]]:
     if noise and is_constant(W, noise):
         what = f"constant to its noise of {noise / mean:.2g} of {mean:.6g} {unit}: taken as constant"
         return ConstantLoad(mean), [Notice("load-constant", place.column, what)]
-    if noise <= NEGLIGIBLE * float(np.ptp(W)):
+    if noise <= NEGLIGIBLE * float(np.ptp(W)) or SELDOM * np.count_nonzero(np.diff(W)) < W.size:
         return SampledLoad(place.t, W), []
     load = SampledLoad(place.t, W, noise=noise)
     steps = np.diff(load.knots)

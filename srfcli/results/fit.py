@@ -339,7 +339,7 @@ class FitResult(Result):
         notes += [str(n) for n in self.experiment.notices if n.kind == "start-value"]
         field = found.state_space is not None and not found.state_space.smooth
         unexplained = self.against or field or any(f.colours for f in fit.runs)  # else each step was where it was taken to be
-        told = ("reset", "drive-misfit", *(("drive-steps",) if unexplained else ()))
+        told = ("reset", "drive-misfit", *(("drive-steps", "load-steps") if unexplained else ()))
         notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind in told]
         notes += [] if self.posterior is None else _posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
@@ -351,15 +351,17 @@ class FitResult(Result):
                 "under so wide a field a recording is followed whatever the parameters are, and the maximum may be a wrong one: "
                 "try --starts 5, or start values nearer to what is known"
             )
-        if self.against:
+        coarse: list[str] = []
+        if found.state_space is not None and found.status is not Status.INTERRUPTED:
+            from srfcli.diagnosis.goodness_of_fit import coarse_readings, uneven_noise
+
+            coarse = coarse_readings(found.state_space)
+            notes += [*uneven_noise(found.state_space), *coarse]
+        if self.against and not coarse:  # rounding alone fails tests of noise
             notes.append(
                 "the model does not explain the recordings: the values may be wrong by more than their errors. "
                 "Try another ageing law or friction law, or `srf diagnose`."
             )
-        if found.state_space is not None and found.status is not Status.INTERRUPTED:
-            from srfcli.diagnosis.goodness_of_fit import coarse_readings, uneven_noise
-
-            notes += [*uneven_noise(found.state_space), *coarse_readings(found.state_space)]
         if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
             notes.append(f"interrupted: {len(found.starts)} of {self.asked} starts were done")
         return notes
