@@ -50,8 +50,8 @@ def check_plain(path: Path) -> os.stat_result:
         kind = _KINDS.get(stat.S_IFMT(found.st_mode), "no regular file")
         hint = "Name a file in it." if kind == "a folder" else "Name a file; save first what comes through a pipe."
         raise SrfError(f"no file {path}, but {kind}", hint, kind="no file")
-    # said to be files; reading may wait or fail
-    if path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix":
+    # said to be files, of no block of a disk; reading may wait or fail
+    if os.name == "posix" and not found.st_blocks and path.resolve().parts[1:2] in (("proc",), ("sys",)):
         raise SrfError(
             f"no file {path}, but a part of the running system", "Name a file; copy what is meant to one first.", kind="no file"
         )

@@ -137,7 +137,7 @@ ORIGIN = "terms"
 def with_terms(registry: Registry) -> Registry:
     """Return the registry with the candidate terms besides; one whose name is taken is left out."""
     taken = {e.name for e in registry.entries("effect")}
-    return Registry((*registry.entries(), *(e for e in _entries() if e.name not in taken)), registry.problems)
+    return registry.plus(e for e in _entries() if e.name not in taken)
 
 
 @lru_cache(maxsize=1)

@@ -15,7 +15,7 @@ import importlib.util
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -59,12 +59,12 @@ class Registry:
     """The laws that were found, by kind and name; a law is loaded when it is first asked for, and then kept."""
 
     def __init__(
-        self, entries: Sequence[Entry], problems: Sequence[Problem] = (), *, named: Sequence[Path] = (), trust: bool = False
+        self, entries: Sequence[Entry], problems: Sequence[Problem] = (), *, own: Iterable[Path] = (), trust: bool = False
     ) -> None:
         self._entries = tuple(sorted(entries, key=lambda e: (PLUGIN_KINDS.index(e.kind), e.name, str(e.location))))
         self.problems = tuple(problems)
         self._trust = trust
-        self._own = {_resolved(path) for path in (*named, *(e.location for e in self._entries))}
+        self._own = frozenset(own)
         self._loaded: dict[Entry, Any] = {}
 
     def entries(self, kind: str | None = None) -> tuple[Entry, ...]:
@@ -72,6 +72,10 @@ class Registry:
         if kind is not None and kind not in PLUGIN_KINDS:
             raise SrfError(f"unknown kind '{kind}'", did_you_mean(kind, PLUGIN_KINDS))
         return tuple(e for e in self._entries if kind in (None, e.kind))
+
+    def plus(self, entries: Iterable[Entry]) -> Registry:
+        """Return the registry with other entries besides, of TOML files; what may run is the same."""
+        return Registry((*self._entries, *entries), self.problems, own=self._own, trust=self._trust)
 
     def clashes(self, entry: Entry) -> tuple[Entry, ...]:
         """Return the other entries of the same kind and name."""
@@ -187,8 +191,8 @@ def load_registry(
     with `trust`. A folder in `plugins` or SRF_PLUGINS that does not exist raises `SrfError`; every other fault becomes a
     `Problem`.
     """
-    collect = _Collector()
-    collect.folder("bundled", bundled_folder())
+    shipped, collect = _bundled(), _Collector()
+    collect.entries, collect.problems, collect.seen = [*shipped.entries], [*shipped.problems], {*shipped.seen}
     if entry_points:
         for point in importlib.metadata.entry_points(group=GROUP):
             collect.entry_point(point)
@@ -206,15 +210,21 @@ def load_registry(
                 raise SrfError(f"{origin}: {path} is neither a folder nor a law's file", "A law's file ends in .toml or .py.")
             check_plain(path)
         collect.folder(origin, path)
-    return Registry(collect.entries, collect.problems, named=named, trust=trust)
+    return Registry(collect.entries, collect.problems, own={*collect.seen, *map(_resolved, named)}, trust=trust)
 
 
 @functools.cache
 def bundled_registry() -> Registry:
     """Return the shipped laws alone."""
+    return Registry(_bundled().entries, _bundled().problems, own=_bundled().seen)
+
+
+@functools.cache
+def _bundled() -> _Collector:
+    """Return what the folder of shipped laws holds, read once in a process."""
     collect = _Collector()
     collect.folder("bundled", bundled_folder())
-    return Registry(collect.entries, collect.problems)
+    return collect
 
 
 def bundled_folder() -> Path:
