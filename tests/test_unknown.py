@@ -29,7 +29,7 @@ from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import Diagnosis, conclude
 from srfcli.inference.fit import Interrupted
 from srfcli.laws.effect_file import formula_text
-from srfcli.laws.registry import bundled_registry, read_law
+from srfcli.laws.registry import bundled_registry, load_registry, read_law
 from srfcli.tasks.law_check import check_law
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
@@ -102,6 +102,7 @@ def test_terms_join_the_registry_and_give_way_to_a_registered_effect():
     assert {p.stem for p in TERMS} <= set(names) and len(names) == len(set(names))
     assert with_terms(wide).entries() == wide.entries()
     assert not {p.stem for p in TERMS} & {e.name for e in SHIPPED.entries("effect")}
+    with_terms(load_registry(trust=True)).check_trusted("own.py")  # what may run there may run here
 
 
 # ---- the force
