@@ -133,7 +133,7 @@ class _Slopes:
     def __init__(self) -> None:
         self._moved: dict[str, str] = {}  # what has the derivatives of a name
         self._lines: list[str] = []
-        self._values: dict[int, str] = {}  # of subexpressions, by node
+        self._values: dict[int, str] = {}  # of subexpressions that move, by node
         self._partials: dict[str, list[str]] = {}  # of the expression at hand, by what has the derivatives
         self._count = 0
 
@@ -190,7 +190,7 @@ class _Slopes:
 
     def _back(self, node: ast.AST, by: str) -> None:
         """Add to the partial derivatives those of an expression by which the whole has the derivative `by`."""
-        if not self.moves(node):
+        if id(node) not in self._values:  # it does not move
             return
         match node:
             case ast.Subscript():
@@ -209,22 +209,22 @@ class _Slopes:
                     self._back(right, by if isinstance(op, ast.Add) else f"(-{by})")
                 elif isinstance(op, ast.Mult):
                     for side, other in ((left, b), (right, a)):
-                        if self.moves(side):
+                        if id(side) in self._values:
                             self._back(side, self._times(by, other))
                 elif isinstance(op, ast.Div):
                     over = self._let(f"{by} / {b}")
                     self._back(left, over)
-                    if self.moves(right):
+                    if id(right) in self._values:
                         self._back(right, self._let(f"-{v} * {over}"))
                 else:
-                    if self.moves(left):
+                    if id(left) in self._values:
                         square = isinstance(right, ast.Constant) and right.value == 2
                         self._back(left, self._times(by, f"2.0 * {a}" if square else f"{b} * pow({a}, {b} - 1.0)"))
-                    if self.moves(right):
+                    if id(right) in self._values:
                         self._back(right, self._times(by, f"{v} * log({a})"))
 
     def _plain(self, node: ast.AST) -> str:
-        return self._values[id(node)] if self.moves(node) else _text(node)
+        return self._values.get(id(node)) or _text(node)
 
     def _times(self, by: str, factor: str) -> str:
         return self._let(f"{by} * {factor}") if by != "1.0" else factor if factor.isidentifier() else self._let(factor)

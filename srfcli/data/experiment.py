@@ -340,13 +340,18 @@ def _late_steps(run: Run, where: str) -> list[Notice]:
 
 
 def _load_steps(run: Run, where: str) -> list[Notice]:
-    """Return a notice where a load steps between two samples, and the drive moves on by more than the noise meanwhile."""
+    """Return a notice where a load steps between two samples, and the drive moves on by more than the noise meanwhile.
+
+    All readings are shifted until the contact is renewed, so that less counts than of a step of the drive.
+    """
     W, path = run.load(run.t)[0], np.abs(run.drive(run.t[:-1])) * np.diff(run.t)
     rise = np.pad(np.abs(np.diff(W)), 1)
     alone = (rise[1:-1] > LOAD_STEP * W[:-1]) & (rise[1:-1] > LOAD_STEP_SHARE * (rise[:-2] + rise[1:-1] + rise[2:]))
+    if not alone.any():
+        return []
     shown = np.where(alone, path * per_elongation(run.observable, run.stiffness, run.first_load), 0.0)
     noise = white_level(run.observed[run.used])
-    if not shown.size or not shown.max() > noise > 0:
+    if not shown.max() > noise > 0:
         return []
     k = int(np.argmax(shown))
     step = f"from {W[k]:.4g} to {W[k + 1]:.4g} {run.load_unit} after t = {run.t[k]:.6g} s"

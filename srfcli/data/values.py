@@ -19,6 +19,7 @@ from srfcli.motion.imposed import Drive, Load
 
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
 OTHER_OBSERVABLES = {"slip": "um", "contact_area": "1"}  # what may be observed besides one of these
+BETWEEN_SAMPLES = ("drive-steps", "load-steps")  # kinds of notices of what was imposed between samples, unknown when
 AREA_GROWTH = 0.05  # of a contact area by e-fold of its age: 0.02 to 0.1 for rock, glass and polymers
 
 

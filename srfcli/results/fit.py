@@ -14,6 +14,7 @@ import numpy as np
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
+from srfcli.data.values import BETWEEN_SAMPLES
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import lag_one
 from srfcli.inference.posterior import not_quadratic
@@ -339,7 +340,7 @@ class FitResult(Result):
         notes += [str(n) for n in self.experiment.notices if n.kind == "start-value"]
         field = found.state_space is not None and not found.state_space.smooth
         unexplained = self.against or field or any(f.colours for f in fit.runs)  # else each step was where it was taken to be
-        told = ("reset", "drive-misfit", *(("drive-steps", "load-steps") if unexplained else ()))
+        told = ("reset", "drive-misfit", *(BETWEEN_SAMPLES if unexplained else ()))
         notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind in told]
         notes += [] if self.posterior is None else _posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
@@ -357,7 +358,7 @@ class FitResult(Result):
 
             coarse = coarse_readings(found.state_space)
             notes += [*uneven_noise(found.state_space), *coarse]
-        if self.against and not coarse:  # rounding alone fails tests of noise
+        if self.against and not (coarse and fit.rms_over_noise() < 1):  # such a fit leaves less than the rounding it allows for
             notes.append(
                 "the model does not explain the recordings: the values may be wrong by more than their errors. "
                 "Try another ageing law or friction law, or `srf diagnose`."
