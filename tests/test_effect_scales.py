@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from srfcli.cli.main import cli
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
 from srfcli.data.experiment import read_experiment
@@ -123,3 +126,18 @@ def test_a_formula_that_is_none_is_told(within: str, said: str, tmp_path: Path) 
     with pytest.raises(SrfError, match=r"mine\.toml") as caught:
         load_registry((tmp_path,), user=False, entry_points=False).get("effect", "mine")
     assert said in caught.value.message
+
+
+def test_a_simulated_effect_has_no_bounds_of_a_search(empty_folder: Path) -> None:
+    """A second slip length of rock, four times the bound of the file, beside the law that has one of its own."""
+    common = ["--interface", "rigid", "--no-inertia", "--set", "D0=10", "--set", "D2=120", "--set", "B2=0.004", "--K", "0.02"]
+    common += ["--W0", "5", "--drive", "20:1, 20:10", "--rate", "5", "--csv", "--quiet"]
+    with_effect, own = (
+        CliRunner().invoke(cli, ["simulate", "--law", law, *effects, *common])
+        for law, effects in (("dieterich-ruina", ["--effect", "second-state"]), ("two-state", []))
+    )
+    assert with_effect.exit_code == own.exit_code == 0, with_effect.output
+    numbers = [np.genfromtxt(StringIO(done.stdout), delimiter=",", names=True)["mu"] for done in (with_effect, own)]
+    assert numbers[0] == pytest.approx(numbers[1], abs=1e-9) and np.ptp(numbers[0]) > 0.01
+    refused = CliRunner().invoke(cli, ["simulate", "--effect", "second-state", "--set", "D2=-1"])
+    assert refused.exit_code == 2 and "D2 = -1 um is below its lower bound" in refused.output

@@ -166,15 +166,19 @@ def to_and_fro(*, strokes: int, K: float = 4e-4, W: float = 0.02, D0: float = 4.
     return np.array(out).T
 
 
-def test_a_reciprocating_tribometer_becomes_a_run_for_each_stroke() -> None:
+@pytest.mark.parametrize("drive", ["Position [um]", "Distance [um]", "Speed [um/s]"])
+def test_a_reciprocating_tribometer_becomes_a_run_for_each_stroke(drive: str) -> None:
+    """The way gone and the speed are recorded without the direction, which the force then tells."""
     t, x, F = to_and_fro(strokes=2)
-    table(["time [s]", "Position [um]", "Friction [uN]", "Normal [mN]"], [t, x, 1e6 * F, 20 + 0 * t])
+    moved = {"Position [um]": x, "Distance [um]": 5.0 * t, "Speed [um/s]": 5.0 + 0 * t}[drive]
+    table(["time [s]", drive, "Friction [uN]", "Normal [mN]"], [t, moved, 1e6 * F, 20 + 0 * t])
     done = srf("new", "run1.csv", "--stiffness", "400 uN/um")
     assert "run1 slides to and fro: 2 strokes, a run each" in done.stderr
     runs = tomli.loads(Path("experiment.toml").read_text())["runs"]
     assert [(r["name"], r.get("direction"), r["holdout"]) for r in runs] == [
         ("run1-1", None, False), ("run1-2", "backward", False),
     ]  # fmt: skip
+    assert runs[0]["window"][1] == pytest.approx(40, abs=0.5)
     assert 40 < runs[1]["window"][0] < 50 and runs[1]["window"][1] == pytest.approx(80, abs=0.1)
     rows = {line.split(",")[0]: line.split(",") for line in srf("fit", ".", "--track", "smooth", "--csv").stdout.splitlines()}
     for name, true in (("A", 0.012), ("B", 0.008), ("D0", 4.0)):

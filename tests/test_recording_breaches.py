@@ -166,6 +166,13 @@ def test_what_no_column_and_no_key_gives(what: str, tmp_path: Path, registry: Re
     assert found.startswith(message) and hint
 
 
+def test_all_that_is_missing_is_named_at_once(tmp_path: Path, registry: Registry) -> None:
+    found, hint = answer(write(tmp_path, toml=NO_DRIVE, one=["a,b,c,spring", *data()[1:]]), registry)
+    for lack in ("no column 'time'; found: a, b, c, spring", "the run has no drive", "the run has no load"):
+        assert lack in found
+    assert "Head it `time [s]`" in hint and "Write drive" in hint and 'Write load = "5 N"' in hint
+
+
 def test_a_saturated_load_is_refused(tmp_path: Path, registry: Registry) -> None:
     lines, W = data(400), np.minimum(5 + np.sin(np.arange(400) / 9), 5.8)
     lines = [lines[0], *(",".join([*c[:2], f"{w:.4f}", c[3]]) for w, c in zip(W, (x.split(",") for x in lines[1:]), strict=True))]

@@ -211,6 +211,12 @@ def read_columns(
         raise SrfError(f"{run.file}: no samples", "A recording needs a line of numbers for each sample.")
     named = {channel.role: channel for channel in channels}
     arrays = {channel.role: values for channel, values in zip(channels[1:], kept[1:], strict=True)}
+    if run.backward:  # a drive may be recorded without its sign
+        for role in ("load_point_velocity", "load_point_displacement"):
+            if (moves := arrays.get(role)) is not None:
+                known = moves[np.isfinite(moves)]
+                gone = known if role == "load_point_velocity" else np.diff(known)
+                arrays[role] = -moves if float(np.sum(gone)) < 0 else moves
     remarks = {c.role: source.remarks[c.heading] for c in channels if c.heading in source.remarks}
     return Columns(run.file, first, rows, kept[0], arrays, named, tuple(notices), remarks)
 
@@ -277,48 +283,44 @@ def _plain(name: str) -> str:
 
 
 def _needed(run: RunDescription, finder: Finder) -> list[Channel]:
-    """Return the channels of a run, the time first."""
+    """Return the channels of a run, the time first; raises SrfError that names all that is missing."""
+    lacks: list[tuple[str, str]] = []  # what, and what to do
     time = finder.find("time")
     names = [name for name, _ in finder.parts]
     if time is None:
-        raise SrfError(
-            f"{run.file}: no column 'time'; found: {', '.join(finder.headings)}",
-            f'Head it `time [s]`, or write [columns] time = {{ name = "...", unit = "s" }}. {_near(["time"], names)}'.strip(),
-        )
+        hint = f'Head it `time [s]`, or write [columns] time = {{ name = "...", unit = "s" }}. {_near(["time"], names)}'
+        lacks.append((f"{run.file}: no column 'time'; found: {', '.join(finder.headings)}", hint))
     roles = (*OBSERVABLES, "shear_stress")
     observables = _wanted(run, finder) or [c for role in roles if (c := finder.find(role))]
     if not observables:
-        raise SrfError(
-            f"{run.file}: none of the columns {', '.join(roles)}; found: {', '.join(finder.headings)}",
-            f"One of them is needed; [columns] can name it. {_near(roles, names)}".strip(),
-        )
+        found = "" if lacks else f"; found: {', '.join(finder.headings)}"
+        hint = f"One of them is needed; [columns] can name it. {_near(roles, names)}"
+        lacks.append((f"{run.file}: none of the columns {', '.join(roles)}{found}", hint))
     seen = observables if run.observables else ([c for c in observables if c.role in finder.specs] or observables)[:1]
-    if len(observables) > len(seen):
+    if len(observables) > len(seen) > 0:
         others = ", ".join(c.role for c in observables if c is not seen[0])
         every = ", ".join(f'"{c.role}"' for c in observables)
         what = f"{seen[0].role} is what is compared; the file also has {others}, left aside (observables = [{every}] takes all)"
         finder.notices.append(Notice("observable", str(run.file), what))
-    channels = [time, *(replace(c, role="force") if c.role == "shear_stress" else c for c in seen)]
     moves = finder.find("load_point_velocity")
     if moves is None and run.drive is None:
         moves = finder.find("load_point_displacement")
         if moves is None:
-            raise SrfError(
-                f"{run.node.where}: the run has no drive, and {run.file} no load_point_velocity or load_point_displacement",
-                f"Write drive = [{{ duration = ..., velocity = ... }}], or name the column. {_near(list(ROLES)[1:3], names)}",
-            )
+            hint = f"Write drive = [{{ duration = ..., velocity = ... }}], or name the column. {_near(list(ROLES)[1:3], names)}"
+            what = f"{run.node.where}: the run has no drive, and {run.file} no load_point_velocity or load_point_displacement"
+            lacks.append((what, hint))
     weights = [c for role in ("normal_load", "normal_stress") if (c := finder.find(role))]
     if len(weights) > 1:
         what = "normal_load is what counts; the file also has normal_stress, left aside"
         finder.notices.append(Notice("load", str(run.file), what))
     if not weights and run.load is None and any(c.role != "friction" for c in seen):
-        raise SrfError(
-            f"{run.node.where}: the run has no load, and {run.file} no normal_load or normal_stress",
-            f'Write load = "5 N", or name the column. {_near(["normal_load", "normal_stress"], names)}'.strip(),
-        )
+        hint = f'Write load = "5 N", or name the column. {_near(["normal_load", "normal_stress"], names)}'
+        lacks.append((f"{run.node.where}: the run has no load, and {run.file} no normal_load or normal_stress", hint))
+    if lacks or time is None:
+        raise SrfError("; ".join(what for what, _ in lacks), " ".join(hint.strip() for _, hint in lacks))
+    channels = [time, *(replace(c, role="force") if c.role == "shear_stress" else c for c in seen)]
     if run.backward:
         channels[1:] = [c if c.role == "contact_area" else replace(c, factor=-c.factor) for c in channels[1:]]
-        moves = replace(moves, factor=-moves.factor) if moves else None
     return [*channels, *([moves] if moves else []), *weights[:1]]
 
 

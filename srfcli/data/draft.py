@@ -33,7 +33,7 @@ from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.groups import levels
 from srfcli.data.imposed import StartsAtRest, Stroke, find_modulation, strokes
 from srfcli.data.scales import scales_of
-from srfcli.data.values import Run
+from srfcli.data.values import Run, told_of_runs
 from srfcli.laws.registry import Registry
 
 NAMED = {  # role -> what headings call it, in small letters without their unit; the first that a file has is taken
@@ -88,7 +88,7 @@ UNIT_SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
 STRESSES = {"normal_load": "normal_stress", "force": "shear_stress"}
 FORCE_OF_STRESS = {stress: force for force, stress in STRESSES.items()}
 OBSERVED = ("elongation", "force", "shear_stress", "friction")
-TOLD = ("friction", "drive-misfit")  # kinds of notices that mean that the file was misread, or is not what it seems
+TOLD = ("friction", "drive-smoothed")  # kinds of notices that mean that the file was misread, or is not what it seems
 NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
 HOLD_SPEED = 0.05  # of the slowest sliding, below which is a hold
 UNLIKE_START = 0.02  # of the friction before the first step: first readings that are farther from it are not of steady sliding
@@ -366,7 +366,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     sketch, runs = _read(sketch, registry)
     if sketch.negative:
         remarks.append("compression is negative in the file: the load counts with the other sign")
-    remarks += [f"{run.name}: {notice.what}" for run in runs for notice in run.notices if notice.kind in TOLD]
+    remarks += told_of_runs(runs, TOLD)
     modulations = _modulations(runs)
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
     remarks.append(f"kind of experiment: {kind}, {why}")

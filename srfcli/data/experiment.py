@@ -134,7 +134,7 @@ def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[M
 
 def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple[Parameter, ...]]:
     """Return the effects that a model has besides its laws, as `open_model` names them, and their parameters."""
-    from srfcli.symbolic.system import apart  # only for a description that has effects
+    from srfcli.symbolic.system import apart, in_a_model  # only for a description that has effects
 
     names, found = [], []
     hint = 'Write effects = ["load-transmission"]; `srf laws --kind effect` lists them.'
@@ -149,14 +149,7 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
             entry.fail(f"'{effect.name}' only replaces what the description says itself", f"Write {', '.join(instead)}.")
         names.append(name)
         found.append(effect)
-    return tuple(names), tuple(_unbounded(p, effect) for effect in apart(found) for p in effect.parameters)
-
-
-def _unbounded(p: Parameter, effect: Effect) -> Parameter:
-    """Return an effect's parameter without bounds if these depend on the recording, which has not been read yet."""
-    if not any(name == p.name and which != "default" for name, which, _ in effect.scaled):
-        return p
-    return replace(p, lower=0.0 if p.lower >= 0 else -math.inf, upper=math.inf)
+    return tuple(names), tuple(p for effect in apart(found) for p in in_a_model(effect))
 
 
 def _place(name: str, node: Node) -> str:
@@ -466,7 +459,7 @@ NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "drive-segmented": "a drive found in noisy velocities",
     "drive-fitted": "a drive found in displacements",
     "drive-steps": "a step of the drive that may have been between two samples, and would show",
-    "drive-misfit": "a drive found in displacements that differ from it by much more than their noise",
+    "drive-smoothed": "a drive found in displacements by a smooth curve",
     "friction": "a friction coefficient that no surfaces have",
     "unit": "a heading and [columns] differ in unit",
     "observable": "more than one observable in the file",

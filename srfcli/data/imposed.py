@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,14 +194,54 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         f"a continuous line of {slopes.size} {pieces}, {told} um/s, fitted through the displacements, "
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
-    kind = "drive-misfit" if line.misfit > UNEXPLAINED * line.noise else "drive-fitted"
-    if kind == "drive-misfit":
-        what += f", {line.misfit / line.noise:.0f} times their noise: look at the column, or state the run's drive"
+    kind = "drive-fitted"
+    if line.misfit > 2 * line.noise:
+        moved = X[known]
+        for at, size in line.jumps if correct else ():
+            moved[at + 1 :] -= size
+        smooth = _smooth_drive(t[known], moved)
+        if line.misfit > UNEXPLAINED * line.noise or (line.misfit > 2 * smooth.misfit and smooth.knots < 2 * line.knots.size):
+            drive, kind = smooth.drive, "drive-smoothed"
+            what = (
+                f"a smooth curve, {drive(t).min():.5g} to {drive(t).max():.5g} um/s, goes through the displacements, from which "
+                f"they differ by {smooth.misfit:.3g} um (rms), {line.misfit:.3g} from {slopes.size} {pieces}; if the stage went "
+                "evenly, look at the column, or state the run's drive"
+            )
     back = int(np.argmin(way))
     if -way[back] > line.misfit:
         told = f"{-way[back]:.3g} um at t = {line.knots[back]:.7g} s"
         what += f"; it goes back by {told}: state the run's drive if the stage did not"
     return drive, [*notices, Notice(kind, where, what)]
+
+
+class _Smooth(NamedTuple):
+    """A drive by a smooth curve through displacements, how many knots the curve has, and its rms misfit."""
+
+    drive: Drive
+    knots: int
+    misfit: float
+
+
+def _smooth_drive(t: Array, X: Array) -> _Smooth:
+    """Return a drive whose velocity changes evenly between many times, by a smooth curve through displacements X (n,).
+
+    The curve is the one that a load has: with noise a smoothing spline, else it goes through the displacements.
+    """
+    noise, size = max(white_level(X, t), quantisation(X)), float(np.ptp(X))
+    noise = noise if noise > LEAST_NOISE * size else 0.0
+    curve = SampledLoad(t, X - X.min() + size, noise=noise)  # of positive numbers
+    allowed = max(noise / 10, SMOOTHEST * size)
+    pieces: list[tuple[float, float, float]] = []
+    for begin, h, row in zip(curve.knots[:-1], np.diff(curve.knots), curve.coefficients, strict=True):
+        way = np.polynomial.Polynomial(row)
+        bend = float(np.abs(way.deriv(3)(np.linspace(0.0, h, 5))).max())
+        count = int(np.clip(np.ceil(h * np.cbrt(bend / (125 * allowed))), 1, MOST_RAMPS))
+        ends = np.linspace(0.0, h, count + 1)
+        rates = way.deriv(2)(0.5 * (ends[:-1] + ends[1:]))
+        V = np.diff(way(ends)) / np.diff(ends) - 0.5 * rates * np.diff(ends)  # displacements at the ends are those of the curve
+        pieces += zip((begin + ends[:-1]).tolist(), V.tolist(), rates.tolist(), strict=True)
+    drive = Drive(*zip(*pieces, strict=True))
+    return _Smooth(drive, curve.knots.size, float(np.std(X - drive.displacement(t))))
 
 
 # A drive that turns back: the laws hold for sliding in one direction, so that each stroke is a run of its own.
@@ -237,9 +278,11 @@ def strokes(columns: Columns) -> list[Stroke]:
         return []
     turns = _turns(x, STROKE_TURN * float(np.ptp(x)))
     usual = float(np.median(np.abs(y)))
+    signed = bool(turns)  # a drive may be recorded without its sign: then the observable has it
+    turns = turns or _turned(y, usual)
     found, slid = [], [False, False]
     for first, last in pairwise([0, *turns, t.size - 1]):
-        backward = bool(x[last] < x[first])
+        backward = bool(x[last] < x[first] if signed else np.median(y[first : last + 1]) < 0)
         shear = -y[first : last + 1] if backward else y[first : last + 1]
         slid[backward] |= bool(np.median(shear[shear.size // 2 :]) > OPPOSED * usual)
         opposed = np.flatnonzero(shear <= OPPOSED * usual)
@@ -248,6 +291,16 @@ def strokes(columns: Columns) -> list[Stroke]:
         if last - begin >= 4 * FEWEST_OF_PIECE:
             found.append(Stroke(float(f"{t[begin]:.10g}"), float(f"{t[last - 1]:.10g}"), backward))
     return found if all(slid) and turns else []
+
+
+def _turned(y: Array, usual: float) -> list[int]:
+    """Return the last samples at which y (n,) is what it usually is, before each change of its sign."""
+    from scipy.ndimage import median_filter
+
+    calm = median_filter(y, size=2 * FEWEST_OF_PIECE + 1, mode="nearest")
+    far = np.flatnonzero(np.abs(calm) > OPPOSED * usual)
+    changes = far[:-1][calm[far[1:]] * calm[far[:-1]] < 0]
+    return [int(np.flatnonzero((np.abs(y[: i + 1]) >= usual) & (y[: i + 1] * calm[i] > 0))[-1]) for i in changes]
 
 
 def _turns(x: Array, least: float) -> list[int]:
@@ -278,7 +331,9 @@ CLEAR = 8.0  # standard deviations about the lines beside it that a level jump e
 SAMPLES_BESIDE = 200  # samples on each side by which a jump is told from a corner
 EVEN = 1e-5  # of the largest noise, at least: with smaller ones the rest would be lost in rounding
 LEAST_NOISE = 1e-100  # um or um/s: a noise whose square is still a number
-UNEXPLAINED = 30.0  # times its noise that a displacement differs from the line, from where that is told
+UNEXPLAINED = 30.0  # times its noise that a displacement differs from the line, from where a smooth curve takes its place
+MOST_RAMPS = 64  # of velocity, to one piece of that curve
+SMOOTHEST = 1e-6  # of the displacement's range, by which they may differ from the curve
 WOBBLE = 0.02  # relative change of slope below which there is no corner
 
 

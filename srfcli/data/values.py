@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -290,3 +290,18 @@ class Experiment:
 def shown_unit(unit: str, *, stress: bool) -> str:
     """Return a unit of N as one of MPa where stresses were recorded."""
     return unit.replace("N", "MPa") if stress and unit in ("N", "N/um", "N/s") else unit
+
+
+def told_of_runs(runs: Iterable[Run], kinds: Collection[str]) -> list[str]:
+    """Return what notices of these kinds say, each kind once: of its first run, with the names of the others that have it."""
+    told: dict[str, list[tuple[str, Notice]]] = {}
+    for run in runs:
+        for notice in run.notices:
+            if notice.kind in kinds:
+                told.setdefault(notice.kind, []).append((run.name, notice))
+    lines = []
+    for (first, notice), *more in told.values():
+        names = list(dict.fromkeys(name for name, _ in more))
+        where = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+        lines.append(f"{first}: {notice}" + (f"; {len(more)} more of this kind, in {where}" if more else ""))
+    return lines

@@ -12,7 +12,7 @@ import numpy as np
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.groups import GAUGE_NOISE
-from srfcli.data.values import BETWEEN_SAMPLES, Experiment, Run
+from srfcli.data.values import BETWEEN_SAMPLES, Experiment, Run, told_of_runs
 from srfcli.diagnosis.goodness_of_fit import improbability, loudness, shortcomings, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, typical_sizes
 from srfcli.diagnosis.scores import ALIKE, Remainder, Score, own_values
@@ -162,7 +162,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     if doubtful:
         reasons += not_the_same(baseline, best if verdict == "identified" else baseline)
     if verdict not in BASELINE_VERDICTS:
-        reasons += [f"{run.name}: {n}" for run in search.whole.runs for n in run.notices if n.kind in BETWEEN_SAMPLES]
+        reasons += told_of_runs(search.whole.runs, BETWEEN_SAMPLES)
     if doubtful and search.on_request:
         reasons.append(
             f"not tried, as they are looked for where they are named alone: {', '.join(search.on_request)}; --effect NAME"

@@ -14,7 +14,7 @@ import numpy as np
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
-from srfcli.data.values import BETWEEN_SAMPLES
+from srfcli.data.values import BETWEEN_SAMPLES, told_of_runs
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import lag_one
 from srfcli.inference.posterior import not_quadratic
@@ -340,8 +340,8 @@ class FitResult(Result):
         notes += [str(n) for n in self.experiment.notices if n.kind == "start-value"]
         field = found.state_space is not None and not found.state_space.smooth
         unexplained = self.against or field or any(f.colours for f in fit.runs)  # else each step was where it was taken to be
-        told = ("reset", "drive-misfit", *(BETWEEN_SAMPLES if unexplained else ()))
-        notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind in told]
+        told = ("reset", "drive-smoothed", *(BETWEEN_SAMPLES if unexplained else ()))
+        notes += told_of_runs(self.experiment.runs, told)
         notes += [] if self.posterior is None else _posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
         if found.friction_field is not None:

@@ -5,6 +5,7 @@ Units are um, s, N; mass is N s^2/um. The spring elongation is u = V t - x, z = 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from srfcli.laws.registry import Registry
 
 L = TypeVar("L", bound=Law)
+
+POSITIVE = 1e-6  # what is above 0 is at least that, as in law files
 
 APPARATUS = (
     Parameter("V", 10.0, "um/s", 1e-12, 1e9, "driving velocity"),
@@ -104,7 +107,7 @@ class System:
             own += RUN_SYMBOLS
         seen = {p.name for p in own}
         for law in self.laws:
-            for parameter in law.parameters:
+            for parameter in in_a_model(law):
                 if parameter.name not in seen:
                     own.append(parameter)
                     seen.add(parameter.name)
@@ -188,6 +191,17 @@ def with_effects(system: System, effects: Sequence[Effect]) -> System:
     joined = replace(system, effects=apart(effects))
     _check_symbols(joined)
     return joined
+
+
+def in_a_model(law: Law) -> tuple[Parameter, ...]:
+    """Return a law's parameters as a model has them: bounds that follow a recording bound a search, and leave the sign alone."""
+    if not isinstance(law, Effect):
+        return law.parameters
+    sought = {name for name, which, _ in law.scaled if which != "default"}
+    return tuple(
+        replace(p, lower=-math.inf if p.lower < 0 else min(p.lower, POSITIVE), upper=math.inf) if p.name in sought else p
+        for p in law.parameters
+    )
 
 
 def apart(effects: Sequence[Effect]) -> tuple[Effect, ...]:
