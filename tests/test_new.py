@@ -14,6 +14,7 @@ import pytest
 import tomli
 from click.testing import CliRunner, Result
 
+import srfcli
 from srfcli.cli.main import cli
 from srfcli.data.noise import ar1
 
@@ -180,15 +181,25 @@ def test_a_reciprocating_tribometer_becomes_a_run_for_each_stroke(drive: str) ->
     ]  # fmt: skip
     assert runs[0]["window"][1] == pytest.approx(40, abs=0.5)
     assert 40 < runs[1]["window"][0] < 50 and runs[1]["window"][1] == pytest.approx(80, abs=0.1)
-    rows = {line.split(",")[0]: line.split(",") for line in srf("fit", ".", "--track", "smooth", "--csv").stdout.splitlines()}
-    for name, true in (("A", 0.012), ("B", 0.008), ("D0", 4.0)):
-        value, error = float(rows[name][1]), float(rows[name][2])
-        assert abs(value - true) < 4 * error < 0.5 * true, name
+    for run in srfcli.read_experiment(Path.cwd()).runs:
+        assert run.drive(run.t) == pytest.approx(5.0, rel=1e-6) and np.median(run.observed) == pytest.approx(
+            np.median(np.abs(F)), rel=0.05
+        )
     # as one run it is refused, with a window and a direction that would do
     whole = Path("experiment.toml").read_text().split("[[runs]]")[0] + '[[runs]]\nname = "all"\nfile = "run1.csv"\n'
     Path("experiment.toml").write_text(whole)
     said = srf("check", ".", code=2).stderr
     assert "the drive turns back before t = 47" in said and 'direction = "backward"' in said
+
+
+def test_the_strokes_of_a_reciprocating_tribometer_are_fitted() -> None:
+    t, x, F = to_and_fro(strokes=2)
+    table(["time [s]", "Position [um]", "Friction [uN]", "Normal [mN]"], [t, x, 1e6 * F, 20 + 0 * t])
+    srf("new", "run1.csv", "--stiffness", "400 uN/um")
+    rows = {line.split(",")[0]: line.split(",") for line in srf("fit", ".", "--track", "smooth", "--csv").stdout.splitlines()}
+    for name, true in (("A", 0.012), ("B", 0.008), ("D0", 4.0)):
+        value, error = float(rows[name][1]), float(rows[name][2])
+        assert abs(value - true) < 4 * error < 0.5 * true, name
 
 
 def test_a_ram_that_unloads_at_the_end_slides_in_one_direction(step: dict[str, np.ndarray]) -> None:

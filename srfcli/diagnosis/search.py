@@ -231,14 +231,19 @@ class ModelSearch:
 
     def _as_it_is(self, move: _Move, smooth: bool, processes: Sequence[str]) -> StateSpaceFit:
         """Return a fit that begins where a move says, under no wider field, without one if `smooth`, with colour as given."""
-        values = self._sized(move, 1.0, move.shifts)
-        problem, least = self._problem(move.hypothesis, values), self.best().evidence - CLOSE_CALL
-        likelihood = Likelihood(problem, smooth=smooth, processes=processes, rtol=SEARCH_RTOL)
-        begun = maximise(likelihood, likelihood.coordinates(values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
-        if not begun.promised > least:
+        likelihood, x = self._begun(move, smooth, processes)
+        begun = maximise(likelihood, x, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
+        if not begun.promised > self.best().evidence - CLOSE_CALL:
             return StateSpaceFit(likelihood, begun)
         options = {"processes": None, "cautious": True, **self.options}
-        return self._state_space(problem, part=StateSpaceFit(likelihood, begun), **options)
+        return self._state_space(likelihood.problem, part=StateSpaceFit(likelihood, begun), **options)
+
+    def _begun(self, move: _Move, smooth: bool, processes: Sequence[str]) -> tuple[Likelihood, Array]:
+        """Return the likelihood of a move's model, without a field if `smooth`, with colour as given, and where it begins."""
+        values = self._sized(move, 1.0, move.shifts)
+        problem = self._problem(move.hypothesis, values)
+        likelihood = Likelihood(problem, smooth=smooth, processes=processes, rtol=SEARCH_RTOL)
+        return likelihood, likelihood.coordinates(values)
 
     def _state_space(self, problem: Problem, **choice: Any) -> StateSpaceFit:
         return fit_state_space(problem, close=NEAR, rtol=SEARCH_RTOL, progress=self.progress, **choice)
@@ -735,10 +740,14 @@ class ModelSearch:
         for i, effect in enumerate(effects):
             others, own = effects[:i] + effects[i + 1 :], sizes[:i] + sizes[i + 1 :]
             node = self.fitted.get(Hypothesis(others, ageing).name)
+            without = self._height(_Move(0.0, 0, Hypothesis(others, ageing), dict(best.fit.values), own, origin=best.fit))
             for score in best.scores.absorbed(node.scores) if node and node.scores else []:
                 hypothesis = Hypothesis((*others, score.effect), ageing)
                 if hypothesis.name not in self.fitted:
-                    self._fit_from(best, hypothesis, (*own, self._instead(effect, score, best)))
+                    moves = self._instead(best, effect, score, hypothesis, own)
+                    height, move = max(((self._height(m), m) for m in moves), key=lambda found: found[0])
+                    if height > without:  # else it does not do the same beyond first order
+                        self._fit_move(move)
         for law in self.laws if ageing else []:
             hypothesis = Hypothesis(effects, "+".join([law, *ageing.split("+")[1:]]))
             likelihood = None if hypothesis.name in self.fitted else self._likelihood(hypothesis, best, law)
@@ -748,8 +757,13 @@ class ModelSearch:
             if likelihood.at(x, slopes=False).log_likelihood > best.fit.log_likelihood - WORTH:
                 self._fit_from(best, hypothesis, sizes)
 
-    def _instead(self, effect: Effect, score: Score, node: Fitted) -> dict[str, float]:
-        """Return the size of what is scored that does at first order what an effect of a fitted model does."""
+    def _instead(
+        self, node: Fitted, effect: Effect, score: Score, hypothesis: Hypothesis, others: tuple[dict[str, float], ...]
+    ) -> Iterator[_Move]:
+        """Yield the model of what is scored, of the size that does at first order what an effect of a fitted model does.
+
+        With the parameters of that model, and with these moved as the score says.
+        """
         model, fitted = node.fit.likelihood.problem.model, node.fit.values
         names = {p.name: long for long, p in own_parameters(effect, model).items()} | {n: n for n in effect.frees}
         size, *_ = (*effect.sizes, *effect.frees)
@@ -758,7 +772,18 @@ class ModelSearch:
         ratio = -(fitted[names[size]] - still) / moved if moved else 1.0
         first, *_ = (*score.effect.sizes, *score.effect.frees)
         begun = neutral_values(score.effect).get(first, fitted.get("K", self.experiment.stiffness))
-        return {**score.values, first: begun + ratio * score.size}
+        sizes = (*others, {**score.values, first: begun + ratio * score.size})
+        for shifts in ({}, {n: ratio * shift for n, shift in score.shifts.items() if n != names[size]}):
+            yield _Move(0.0, 0, hypothesis, dict(fitted), sizes, shifts=shifts, origin=node.fit)
+
+    def _height(self, move: _Move) -> float:
+        """Return the log likelihood where a move begins, field and noise as in the fit that it comes from."""
+        assert move.origin is not None
+        try:
+            likelihood, x = self._begun(move, move.origin.smooth, move.origin.likelihood.processes)
+        except SrfError:  # told where it is fitted
+            return np.inf
+        return likelihood.at(x, slopes=False).log_likelihood
 
     def _try_laws_afresh(self, base: Fitted) -> None:
         """Fit the other ageing laws, the file's own start values tried, too: an effect, or the field, may pass for another law.
@@ -870,11 +895,15 @@ class ModelSearch:
                 self._fit_from(best, one, self._sizes(best))
 
     def _fit_from(self, node: Fitted, hypothesis: Hypothesis, sizes: tuple[dict[str, float], ...]) -> None:
-        """Fit a model from the parameters of another that was fitted; what cannot be fitted is left out, with the reason."""
+        """Fit a model from the parameters of another that was fitted."""
+        self._fit_move(_Move(0.0, 0, hypothesis, dict(node.fit.values), sizes, origin=node.fit))
+
+    def _fit_move(self, move: _Move) -> None:
+        """Fit a model where a move says; what cannot be fitted is left out, with the reason."""
         try:
-            self._record(self.fit(_Move(0.0, 0, hypothesis, dict(node.fit.values), sizes, origin=node.fit)))
+            self._record(self.fit(move))
         except SrfError as error:
-            self.excluded.append(Excluded(hypothesis.name, error.message))
+            self.excluded.append(Excluded(move.hypothesis.name, error.message))
 
     def _eliminate(self, best: Fitted) -> None:
         """Refit the best model, and what comes close, with one part less from its parameters (backward elimination).

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.integrate import trapezoid
 
 from srfcli.codegen.model import Array
 from srfcli.codegen.splines import Spline
@@ -95,7 +94,7 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
 
 def _track(runs: Sequence[Run]) -> Spline:
     """Return a smooth track that covers the slip of these runs."""
-    low, high = min(r.start for r in runs), max(r.start + float(trapezoid(r.drive(r.t), r.t)) for r in runs)
+    low, high = min(r.start for r in runs), max(r.start + float(r.drive.displacement(r.t)[-1]) for r in runs)
     return Spline.over(low - 1.0, high + 2.0, max(KNOT_SPACING, (high - low) / (MOST_KNOTS - 3)))
 
 

@@ -1457,7 +1457,7 @@ def _narrow(
         if most < np.sum(moved) < LOST_CURVATURE * np.sum(told) * reach**2:
             most = float(np.sum(moved))
             few = min(int(np.searchsorted(np.cumsum(moved), 8 * PEAK)) + 1, moved.size)
-            readings = int(f.used[few - 1]) // len(f.run.signals) + 1
+            readings = max(int(f.used[few - 1]) // len(f.run.signals) + 1, 2)  # one alone has no interval
             found = f.run.part(slice(None, readings)), float(np.sqrt(np.sum(moved[:few]) / (2 * np.sum(told[:few]))))
     return found
 
