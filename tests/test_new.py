@@ -192,6 +192,16 @@ def test_a_reciprocating_tribometer_becomes_a_run_for_each_stroke(drive: str) ->
     assert "the drive turns back before t = 47" in said and 'direction = "backward"' in said
 
 
+def test_a_stroke_may_have_less_force_than_the_others() -> None:
+    """A gauge with an offset reads 0.3 N one way and -0.5 N the other."""
+    t = np.arange(0, 60, 0.05)
+    F = np.where(t % 20 < 10, 0.3, -0.5) + np.random.default_rng(1).normal(0, 0.01, t.size)
+    table(["time [s]", "Speed [um/s]", "force [N]", "load [N]"], [t, 20 + 0 * t, F, 1 + 0 * t])
+    assert "run1 slides to and fro: 6 strokes" in srf("new", "run1.csv", "--stiffness", "0.1 N/um").stderr
+    runs = tomli.loads(Path("experiment.toml").read_text())["runs"]
+    assert [r["window"][1] for r in runs] == pytest.approx([10, 20, 30, 40, 50, 60], abs=0.5)
+
+
 def test_the_strokes_of_a_reciprocating_tribometer_are_fitted() -> None:
     t, x, F = to_and_fro(strokes=2)
     table(["time [s]", "Position [um]", "Friction [uN]", "Normal [mN]"], [t, x, 1e6 * F, 20 + 0 * t])

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,18 +194,16 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
     kind = "drive-fitted"
-    if line.misfit > 2 * line.noise:
-        moved = X[known]
-        for at, size in line.jumps if correct else ():
-            moved[at + 1 :] -= size
-        smooth = _smooth_drive(t[known], moved)
-        if line.misfit > UNEXPLAINED * line.noise or (line.misfit > 2 * smooth.misfit and smooth.knots < 2 * line.knots.size):
-            drive, kind = smooth.drive, "drive-smoothed"
-            what = (
-                f"a smooth curve, {drive(t).min():.5g} to {drive(t).max():.5g} um/s, goes through the displacements, from which "
-                f"they differ by {smooth.misfit:.3g} um (rms), {line.misfit:.3g} from {slopes.size} {pieces}; if the stage went "
-                "evenly, look at the column, or state the run's drive"
-            )
+    moved = X[known]
+    for at, size in line.jumps if correct else ():
+        moved[at + 1 :] -= size
+    if line.misfit > UNEXPLAINED * line.noise or (line.misfit > 2 * line.noise and _bends(t[known], moved, line)):
+        drive, kind = _smooth_drive(t[known], moved), "drive-smoothed"
+        what = (
+            f"a smooth curve, {drive(t).min():.5g} to {drive(t).max():.5g} um/s, goes through the displacements, from which "
+            f"they differ by {np.std(moved - drive.displacement(t[known])):.3g} um (rms), {line.misfit:.3g} from {slopes.size} "
+            f"{pieces}; if the stage went evenly, look at the column, or state the run's drive"
+        )
     back = int(np.argmin(way))
     if -way[back] > line.misfit:
         told = f"{-way[back]:.3g} um at t = {line.knots[back]:.7g} s"
@@ -214,15 +211,19 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
     return drive, [*notices, Notice(kind, where, what)]
 
 
-class _Smooth(NamedTuple):
-    """A drive by a smooth curve through displacements, how many knots the curve has, and its rms misfit."""
+def _bends(t: Array, X: Array, line: Line) -> bool:
+    """Return whether a spline of as many numbers as the line leaves less than half of what the line leaves of X (n,)."""
+    from scipy.interpolate import make_lsq_spline
 
-    drive: Drive
-    knots: int
-    misfit: float
+    inner = np.linspace(t[0], t[-1], 2 * line.knots.size)[1:-1]
+    try:
+        spline = make_lsq_spline(t, X, np.concatenate([[t[0]] * 4, inner, [t[-1]] * 4]), k=3)
+    except ValueError:  # no reading between two of its knots
+        return False
+    return bool(np.std(X - spline(t)) < line.misfit / 2)
 
 
-def _smooth_drive(t: Array, X: Array) -> _Smooth:
+def _smooth_drive(t: Array, X: Array) -> Drive:
     """Return a drive whose velocity changes evenly between many times, by a smooth curve through displacements X (n,).
 
     The curve is the one that a load has: with noise a smoothing spline, else it goes through the displacements.
@@ -240,8 +241,7 @@ def _smooth_drive(t: Array, X: Array) -> _Smooth:
         rates = way.deriv(2)(0.5 * (ends[:-1] + ends[1:]))
         V = np.diff(way(ends)) / np.diff(ends) - 0.5 * rates * np.diff(ends)  # displacements at the ends are those of the curve
         pieces += zip((begin + ends[:-1]).tolist(), V.tolist(), rates.tolist(), strict=True)
-    drive = Drive(*zip(*pieces, strict=True))
-    return _Smooth(drive, curve.knots.size, float(np.std(X - drive.displacement(t))))
+    return Drive(*zip(*pieces, strict=True))
 
 
 # A drive that turns back: the laws hold for sliding in one direction, so that each stroke is a run of its own.
@@ -294,13 +294,17 @@ def strokes(columns: Columns) -> list[Stroke]:
 
 
 def _turned(y: Array, usual: float) -> list[int]:
-    """Return the last samples at which y (n,) is what it usually is, before each change of its sign."""
+    """Return the last samples at which y (n,) is what it usually is in a stroke, before each change of its sign."""
     from scipy.ndimage import median_filter
 
     calm = median_filter(y, size=2 * FEWEST_OF_PIECE + 1, mode="nearest")
     far = np.flatnonzero(np.abs(calm) > OPPOSED * usual)
-    changes = far[:-1][calm[far[1:]] * calm[far[:-1]] < 0]
-    return [int(np.flatnonzero((np.abs(y[: i + 1]) >= usual) & (y[: i + 1] * calm[i] > 0))[-1]) for i in changes]
+    turns, begin = [], 0
+    for i in far[:-1][calm[far[1:]] * calm[far[:-1]] < 0].tolist():
+        shear = y[begin : i + 1] * np.sign(calm[i])
+        turns.append(begin + int(np.flatnonzero(shear >= np.median(shear[shear > OPPOSED * usual]))[-1]))
+        begin = i + 1
+    return turns
 
 
 def _turns(x: Array, least: float) -> list[int]:
