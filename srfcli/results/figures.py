@@ -151,6 +151,10 @@ def imposed_scale(axis: Axes, values: Any, *, wide: bool) -> None:
         axis.locator_params(axis="y", nbins=3)
     elif wide and values.min() > 0 and size > DECADES * values.min():
         axis.set_yscale("log")
+        if np.floor(np.log10(size)) - np.ceil(np.log10(values.min())) < 2:  # fewer than three decades to label
+            ends = [float(values.min()), size]
+            axis.set_yticks(ends, [f"{x:.3g}" for x in ends])
+        axis.set_yticks([], minor=True)
     elif wide and size > DECADES * float(np.median(np.abs(values))) > 0:  # with a stop or a move back among them
         threshold = float(np.median(np.abs(values)))
         axis.set_yscale("symlog", linthresh=threshold)
