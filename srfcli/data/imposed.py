@@ -236,7 +236,8 @@ def _smooth_drive(t: Array, X: Array) -> Drive:
     for begin, h, row in zip(curve.knots[:-1], np.diff(curve.knots), curve.coefficients, strict=True):
         way = np.polynomial.Polynomial(row)
         bend = float(np.abs(way.deriv(3)(np.linspace(0.0, h, 5))).max())
-        count = int(np.clip(np.ceil(h * np.cbrt(bend / (125 * allowed))), 1, MOST_RAMPS))
+        # a cubic leaves the ramp that has its ends and its mean slope by bend h^3 / (72 sqrt 3) at most
+        count = int(np.clip(np.ceil(h * np.cbrt(bend / (72 * np.sqrt(3.0) * allowed))), 1, MOST_RAMPS))
         ends = np.linspace(0.0, h, count + 1)
         rates = way.deriv(2)(0.5 * (ends[:-1] + ends[1:]))
         V = np.diff(way(ends)) / np.diff(ends) - 0.5 * rates * np.diff(ends)  # displacements at the ends are those of the curve
