@@ -12,6 +12,10 @@ colour      the gauge's noise is white in every model
 projection  effects are scored by what they explain of the misfit alone: what parameters, field or gauge noise could explain as
             well is not taken off
 
+A step of the search, left out, is one of those of `srfcli.diagnosis.search.ModelSearch`:
+
+{steps}
+
 A constant is one of `srfcli.diagnosis` or `srfcli.inference`, which has one meaning wherever it is used.
 
 What the held-out runs are worth, and what the Bayesian information criterion alone would choose, needs no second diagnosis:
@@ -71,13 +75,44 @@ class WithoutProjection(ModelSearch):
     remainder = Bare
 
 
+STEPS = {  # a step: the method that is left out
+    "another-ageing-law-near-by": "_try_ageing_laws",
+    "another-ageing-law-from-the-file": "_try_laws_afresh",
+    "scores-without-field": "_expand_without_field",
+    "noise-of-each-run": "_with_own_noise",
+    "all-noise": "_refit_noise",
+    "all-that-waits": "_fit_what_waits",
+    "rivals": "_try_rivals",
+    "scans": "_scanned",
+    "sizes": "_resized",
+    "all-runs": "_in_all_runs",
+    "one-run": "_in_one_run",
+    "elimination": "_eliminate",
+    "surprises": "_revise",
+    "failures": "_expect_elsewhere",
+}
+
+
+def without_step(name: str) -> type[ModelSearch]:
+    """Return the search without one of its steps."""
+    kept = (lambda self, node: node) if name == "noise-of-each-run" else (lambda self, *of: None)
+    return type("Without" + name.title().replace("-", ""), (ModelSearch,), {STEPS[name]: kept})
+
+
 PARTS: dict[str, type[ModelSearch]] = {"field": WithoutField, "colour": WithoutColour, "projection": WithoutProjection}
+PARTS |= {name: without_step(name) for name in STEPS}
+__doc__ = (__doc__ or "").format(steps="\n".join(f"{name:34}{method}" for name, method in STEPS.items()))
 
 
 def holding(name: str) -> list[ModuleType]:
     """Return the modules of the diagnosis that have a constant, which is a number."""
     own = [m for n, m in sys.modules.items() if n.startswith(("srfcli.diagnosis.", "srfcli.inference."))]
     return [m for m in own if isinstance(getattr(m, name, None), int | float)]
+
+
+def diagnose_without(folder: Path, plugins: tuple[Path, ...], *, part: str) -> Answer:
+    """Return what the diagnosis says without a part or a step."""
+    return diagnose_case(folder, plugins, by=PARTS[part])
 
 
 def diagnose_with(folder: Path, plugins: tuple[Path, ...], *, constant: str) -> Answer:
@@ -100,7 +135,7 @@ def answered(bank: Path, change: str, names: Sequence[str], workers: int, kept: 
     known = read_answers(path) if path else {}
     waiting = [name for name in names if name not in known]
     how, _, what = change.partition(" ")
-    by = functools.partial(diagnose_case, by=PARTS[what]) if how == "without" else functools.partial(diagnose_with, constant=what)
+    by = functools.partial(diagnose_without, part=what) if how == "without" else functools.partial(diagnose_with, constant=what)
     tasks = [Task(bank / name, (), by, LIMIT) for name in waiting]
     found = dict(known)
     for _, answer in run_processes(

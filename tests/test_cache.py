@@ -293,7 +293,9 @@ def built(tmp_path_factory: pytest.TempPathFactory, make_model) -> Path:
 
 @pytest.mark.usefixtures("fresh")
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
-@pytest.mark.parametrize("how", ["as it was", "of another name", "not to be written"])
+@pytest.mark.parametrize(
+    "how", ["as it was", *(pytest.param(h, marks=pytest.mark.slow) for h in ("of another name", "not to be written"))]
+)
 def test_a_method_that_is_not_this_user_s_is_compiled_anew(
     built: Path, folder: Path, tmp_path: Path, make_model, how: str
 ) -> None:

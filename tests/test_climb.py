@@ -61,6 +61,7 @@ def test_the_state_and_its_multiplier_are_those_of_shooting(rigid):
     assert abs(found.multipliers[0]) == pytest.approx(leading, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_at_the_critical_load_the_multiplier_by_shooting_is_one(rigid):
     (point,) = critical_line(rigid, rigid.vector({"V": V, "eps": EPS}), lo=3.0, hi=60.0).points
     assert point.status.ok

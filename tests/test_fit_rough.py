@@ -32,6 +32,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.slow
 def test_mass_and_compliance_are_found_from_twice_their_values(tmp_path):
     """An oscillation that a modulation begins, at the noise of a good gauge; the truth is that of the simulation."""
     drive, gauge = ["--drive", "0.6:10", "--W0", "7", "--eps", "0.1", "--onset", "0.1"], ["--rate", "1000", "--noise", "0.002"]

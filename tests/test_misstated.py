@@ -134,6 +134,7 @@ def test_a_line_that_coloured_noise_hides_at_one_lag_is_found(tmp_path: Path) ->
     assert frequency == pytest.approx(3.1, rel=0.03) and 0.004 < size < 0.03
 
 
+@pytest.mark.slow
 def test_friction_that_drifts_with_slip_is_no_slow_field(tmp_path: Path) -> None:
     """Of two variants of one effect both are fitted, and from no wider field than promised them."""
     made = ("--effect", "friction-drift-slip", "--set", "rate=2e-5", "--set", "onset=0")
@@ -146,6 +147,7 @@ def test_friction_that_drifts_with_slip_is_no_slow_field(tmp_path: Path) -> None
     assert rate["value"] == pytest.approx(2e-5, abs=4 * rate["stderr"])
 
 
+@pytest.mark.slow
 def test_a_compliance_that_is_a_wrong_stiffness_under_one_load_is_not_all_that_is_named(tmp_path: Path) -> None:
     """1/K + lambda/W is all that either does: what is found first must not hide the other."""
     restated(record(tmp_path / "run"), ('stiffness = "0.1 N/um"', 'stiffness = "0.13 N/um"'))
@@ -153,6 +155,7 @@ def test_a_compliance_that_is_a_wrong_stiffness_under_one_load_is_not_all_that_i
     assert found.verdict == "ambiguous" and set(found.effects) == {"interface-compliance", "stiffness-error"}
 
 
+@pytest.mark.slow
 def test_what_another_ageing_law_has_of_its_own_is_fitted(tmp_path: Path) -> None:
     law = ("--ageing", "nagata", "--set", "mu0=0.6", "--set", "A=0.03", "--set", "B=0.034", "--set", "D0=3", "--set", "c=1.5")
     description = record(tmp_path / "run", law=law, drive="30:3,10:30,20:3,30:0,30:3,14:9")
@@ -166,7 +169,7 @@ def test_what_another_ageing_law_has_of_its_own_is_fitted(tmp_path: Path) -> Non
 
 def test_a_declared_modulation_counts_between_samples_that_are_too_few_for_it(tmp_path: Path) -> None:
     """At 200 Hz a load of 120 Hz looks like one of 80 Hz: the column agrees with both, and the spline through it with none."""
-    rig = ("--law", "srf-vsat", "--K", "0.21 N/um", "--W0", 7, "--eps", 0.15, "--onset", 0.5, "--drive", "2:8,1:16")
+    rig = ("--law", "srf-vsat", "--K", "0.21 N/um", "--W0", 7, "--eps", 0.15, "--onset", 0.2, "--drive", "0.8:8,0.4:16")
     srf("simulate", *rig, "--rate", 200, "--noise", 0.05, "--seed", 3, "--free", "A,B,D0", "--out-dir", tmp_path / "run")
     fitted = json.loads(srf("fit", tmp_path / "run", "--json").stdout)
     assert fitted["status"] == "ok"

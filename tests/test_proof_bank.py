@@ -77,7 +77,10 @@ def contents(folder):
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-@pytest.mark.parametrize("name", [None, *NAMES, *OUTSIDE_NAMES])
+# without --runslow every third, none among them
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if i % 3 else ()) for i, n in enumerate((None, *NAMES, *OUTSIDE_NAMES))]
+)
 def test_every_case_reads_back_and_gives_nothing_away(quick, tmp_path, name):
     truth = make_case(tmp_path / "c", 7, effects=[name] if name else [], size=0.8, rough=False, strengths=False)
     experiment = read_experiment(tmp_path / "c", registry=load_registry())

@@ -42,6 +42,7 @@ from srfcli.validation.slider import (
 GENERATOR = ("slider", "gauge", "apparatus", "cases")
 NOISE = float(np.hypot(0.02, 0.005 / np.sqrt(12)))  # um, of a gauge and its quanta
 OPEN = [f"open-{n:02d}" for n in range(1, 9)]
+BRIEFLY = ("open-02", "open-06", "open-08")  # without --runslow: an effect of the load, one of the age, two on a track
 EXAMPLES = {plan.name: plan for plan in example_protocol()}
 # of runs under a modulation, which cost most to integrate, the first half; sampled as the whole is
 BRIEF = {"onset": ((0.5, 12), (2.5, 8)), "strong": ((1.2, 20),), "holdout-mod": ((1.6, 15),)}
@@ -62,7 +63,7 @@ def rms(x):
 # ---- against recordings and predictions made by others
 
 
-@pytest.mark.parametrize("case", OPEN)
+@pytest.mark.parametrize("case", [c if c in BRIEFLY else pytest.param(c, marks=pytest.mark.slow) for c in OPEN])
 def test_known_truth_explains_the_example_down_to_its_noise(shared, case):
     """The effects mean what the examples' truth means by them: the recordings were made by neither side here."""
     told = json.loads((shared / "cases" / "truth.json").read_text())[case]

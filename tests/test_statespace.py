@@ -460,6 +460,7 @@ def test_a_maximisation_does_not_end_below_what_it_passed(make_model):
         assert found.point.log_likelihood > max(float(text.split()[2].rstrip(",")) for text in said) - 2.0
 
 
+@pytest.mark.slow
 def test_from_far_off_a_score_promises_no_more_than_there_is(make_model):
     """Where a narrow field follows wrong parameters badly, half the squared distance in standard errors is no gain to come."""
     true = {"mu0": 0.43, "A": 0.0128, "B": 0.0263, "D0": 0.38, "lambda": 0.55}

@@ -108,6 +108,7 @@ def test_terms_join_the_registry_and_give_way_to_a_registered_effect():
 # ---- the force
 
 
+@pytest.mark.slow
 def test_the_force_stands_where_the_track_is_rough(bump):
     """Found in both runs at that place, though neither place nor form is assumed."""
     diagnosis, _ = bump
@@ -176,7 +177,11 @@ def test_the_form_is_offered_as_an_effect(age):
 
 @pytest.mark.parametrize(
     ("end", "code", "said"),
-    [(KeyboardInterrupt, 130, "did not end"), (Interrupted, 130, "did not end"), (RuntimeError, 0, "RuntimeError: no")],
+    [
+        pytest.param(KeyboardInterrupt, 130, "did not end", marks=pytest.mark.slow),
+        (Interrupted, 130, "did not end"),
+        pytest.param(RuntimeError, 0, "RuntimeError: no", marks=pytest.mark.slow),
+    ],
 )
 def test_a_verdict_outlives_its_explanation(age, tmp_path, monkeypatch, without_figures, end, code, said):
     """Where the search for a closed form is interrupted, or fails, verdict and missing force are written all the same."""

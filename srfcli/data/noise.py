@@ -297,15 +297,21 @@ def generator(seed: int, stream: str) -> np.random.Generator:
 
 def ar1(n: int, lag1: float, *, rng: np.random.Generator) -> Array:
     """Return `n` samples of unit variance, each correlated with its predecessor by `lag1`, from the stationary state on."""
-    from scipy.signal import lfilter
-
     white = rng.standard_normal(n)
-    if not lag1:
+    if not lag1 or not n:
         return white
-    innovation = math.sqrt(1 - lag1 * lag1)
-    if n:
-        white[0] /= innovation  # the first sample has no predecessor and the same variance
-    return np.asarray(lfilter([innovation], [1.0, -lag1], white), dtype=float)
+    white[1:] *= math.sqrt(1 - lag1 * lag1)  # the first sample has no predecessor and the same variance
+    return _carried(lag1, white)
+
+
+def _carried(carry: float, added: Array, before: float = 0.0) -> Array:
+    """Return y (n,) with y[k] = carry y[k-1] + added[k], where y[-1] = before, for n > 0."""
+    from scipy.linalg import solve_banded  # lfilter does the same, and scipy.signal takes longer to import than all else here
+
+    bands = np.ones((2, added.size))
+    bands[1] = -carry
+    start = np.concatenate([[added[0] + carry * before], added[1:]])
+    return np.asarray(solve_banded((1, 0), bands, start, overwrite_ab=True, overwrite_b=True, check_finite=False))
 
 
 def quantised(values: Array, quantum: float) -> Array:
@@ -387,7 +393,6 @@ class FrictionField:
 
         That sum is a Markov process by itself, of first order, and drives the value as another: two recursions.
         """
-        from scipy.signal import lfilter
         from scipy.special import gammainc
 
         if not count:
@@ -399,6 +404,6 @@ class FrictionField:
         spread = math.sqrt(2 * one)
         shared, own = two / spread, math.sqrt(three - two * two / (2 * one))
         draws = rng.standard_normal((count, 2))
-        states = lfilter([1.0], [1.0, -carry], spread * draws[:, 0], zi=[carry * state])[0]
+        states = _carried(carry, spread * draws[:, 0], state)
         pushed = carry * a * np.concatenate([[state], states[:-1]]) + shared * draws[:, 0] + own * draws[:, 1]
-        return np.asarray(lfilter([1.0], [1.0, -carry], pushed, zi=[carry * value])[0])
+        return _carried(carry, pushed, value)

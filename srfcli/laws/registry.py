@@ -28,6 +28,7 @@ from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, read_header, 
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, Law, Reader
 
 GROUP = "srf.laws"
+BUNDLED = "bundled"
 PLUGIN_SOURCES = ("--plugins", "SRF_PLUGINS")
 CHECK_PATH = "Check path and permissions."
 
@@ -123,9 +124,10 @@ class Registry:
 
     def load(self, entry: Entry) -> Law:
         """Return the law of an entry, imported or parsed at the first call."""
+        if entry.origin == BUNDLED:
+            return _shipped(entry)
         if entry not in self._loaded:
-            toml = entry.location.suffix == ".toml"
-            self._loaded[entry] = read_law(entry.location) if toml else find_value(entry)
+            self._loaded[entry] = read_entry(entry)
         return self._loaded[entry]
 
     def reader(self, entry: Entry) -> Reader:
@@ -194,7 +196,7 @@ def load_registry(
     shipped, collect = _bundled(), _Collector()
     collect.entries, collect.problems, collect.seen = [*shipped.entries], [*shipped.problems], {*shipped.seen}
     if entry_points:
-        for point in importlib.metadata.entry_points(group=GROUP):
+        for point in _entry_points(tuple(sys.path)):
             collect.entry_point(point)
     if user and user_folder().is_dir():
         collect.folder("user", user_folder())
@@ -223,8 +225,20 @@ def bundled_registry() -> Registry:
 def _bundled() -> _Collector:
     """Return what the folder of shipped laws holds, read once in a process."""
     collect = _Collector()
-    collect.folder("bundled", bundled_folder())
+    collect.folder(BUNDLED, bundled_folder())
     return collect
+
+
+@functools.cache
+def _shipped(entry: Entry) -> Law:
+    """Return the law of a shipped file, read once in a process."""
+    return read_entry(entry)
+
+
+@functools.cache
+def _entry_points(path: tuple[str, ...]) -> tuple[importlib.metadata.EntryPoint, ...]:
+    """Return the entry points of what is installed on this path, whose every package is asked once in a process."""
+    return tuple(importlib.metadata.entry_points(group=GROUP))
 
 
 def bundled_folder() -> Path:
@@ -239,6 +253,11 @@ def user_folder() -> Path:
     if os.environ.get("SRF_DATA"):
         return Path(os.environ["SRF_DATA"])
     return user_base("XDG_DATA_HOME", ".local/share") / "srf" / "plugins"
+
+
+def read_entry(entry: Entry) -> Any:
+    """Return the law or reader of an entry: a TOML file is parsed, a Python plugin imported."""
+    return read_law(entry.location) if entry.location.suffix == ".toml" else find_value(entry)
 
 
 def read_law(path: Path) -> Law:

@@ -110,19 +110,18 @@ def _candidates(model: GeneratedModel, p: Array) -> list[float]:
         return [float(r) for r in real if r > 0]
     loads = SCANNED_LOADS * p[model.index("K")]
 
-    def last_but_one(W0: Array | float) -> Array:
+    def last_but_one(W0: Array) -> Array:
         with np.errstate(all="ignore"):  # rates may have a pole
             return _hurwitz(model.characteristic(_with_load(model, p, W0)))
 
-    values, found = last_but_one(loads), []
-    for i in np.nonzero(np.isfinite(values[:-1]) & np.isfinite(values[1:]) & (values[:-1] * values[1:] <= 0))[0]:
-        a, b = loads[i], loads[i + 1]
-        for _ in range(60):
-            middle = np.sqrt(a * b)
-            value = last_but_one(middle)
-            a, b = (middle, b) if value * values[i] > 0 else (a, middle)
-        found.append(float(np.sqrt(a * b)))
-    return found
+    values = last_but_one(loads)
+    (i,) = np.nonzero(np.isfinite(values[:-1]) & np.isfinite(values[1:]) & (values[:-1] * values[1:] <= 0))
+    a, b = loads[i], loads[i + 1]
+    for _ in range(60 if i.size else 0):  # bisection, in all intervals at once: where it rounds there are hundreds
+        middle = np.sqrt(a * b)
+        above = last_but_one(middle) * values[i] > 0
+        a, b = np.where(above, middle, a), np.where(above, b, middle)
+    return np.sqrt(a * b).tolist()
 
 
 def _hurwitz(a: Array) -> Array:

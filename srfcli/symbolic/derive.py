@@ -144,23 +144,22 @@ def _abbreviate(slope: sp.Expr, name: str, back: dict[sp.Symbol, sp.Expr]) -> sp
     return stand_in
 
 
-@lru_cache(maxsize=32)
 def ageing_slopes(system: System) -> tuple[dict[str, sp.Expr], ...]:
     """Return for each state what d(ln phi)/dt changes by with ln v, ln phi, mu, W and the rates, in steady sliding."""
+    ages = zip(system.friction.states, steady_states(system), strict=True)
+    return tuple(_slopes(state_rate(system, state), symbol(state.name), age) for state, age in ages)
+
+
+@lru_cache(maxsize=32)  # of a rigid interface, and without inertia, they are the same
+def _slopes(rate: sp.Expr, phi: sp.Symbol, age: sp.Expr) -> dict[str, sp.Expr]:
     v, V = symbol("v"), symbol("V")
     still = {symbol(k): sp.S.Zero for k in ("mu_dot", "W_dot", "F_dot_over_W")}
-    steady = steady_states(system)
-    found = []
-    for state, age in zip(system.friction.states, steady, strict=True):
-        phi = symbol(state.name)
-        rate = state_rate(system, state) / phi
-        at = [(phi, age), (v, V), (symbol("mu"), symbol("mu_ss")), (symbol("W"), symbol("W0"))]
-        names = {"v": v, "phi": phi, **{k: symbol(k) for k in ("mu", "W", "mu_dot", "W_dot", "F_dot_over_W")}}
-        slopes = {k: settle(sp.diff(rate, x).subs(still).subs(at)) for k, x in names.items()}
-        slopes["v"] = settle(V * slopes["v"])
-        slopes["phi"] = settle(age.subs(v, V) * slopes["phi"])
-        found.append(slopes)
-    return tuple(found)
+    at = [(phi, age), (v, V), (symbol("mu"), symbol("mu_ss")), (symbol("W"), symbol("W0"))]
+    names = {"v": v, "phi": phi, **{k: symbol(k) for k in ("mu", "W", "mu_dot", "W_dot", "F_dot_over_W")}}
+    slopes = {k: settle(sp.diff(rate / phi, x).subs(still).subs(at)) for k, x in names.items()}
+    slopes["v"] = settle(V * slopes["v"])
+    slopes["phi"] = settle(age.subs(v, V) * slopes["phi"])
+    return slopes
 
 
 def paper_coefficients(symbolic: tuple[sp.Expr, ...]) -> tuple[sp.Expr, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
+from scipy.linalg import solve_banded
 
 SIGMA, QUANTUM, REDDEST = 0.02, 0.005, 0.85
 SPIKE = (0.3, 1.0)  # of the reading: electrical glitches, which nobody takes for readings
@@ -30,7 +30,8 @@ def read_gauge(u: Array, gauge: Gauge, rng: np.random.Generator) -> Array:
     """Return the readings (n,) of u (n,): with noise that is autoregressive or in part 1/f, with spikes, rounded."""
     draws = rng.standard_normal(u.size)
     draws[1:] *= np.sqrt(1 - gauge.lag1**2)  # the first is as wide as all that follow
-    noise = gauge.sigma * lfilter([1.0], [1.0, -gauge.lag1], draws)
+    bands = np.array([np.ones(u.size), np.full(u.size, -gauge.lag1)])
+    noise = gauge.sigma * solve_banded((1, 0), bands, draws)  # each sample is its own draw and lag1 times the one before
     if gauge.pink:
         gains = _pink_gains(u.size)
         slow = np.fft.irfft(gains * np.fft.rfft(rng.standard_normal(2 * (gains.size - 1))))[: u.size]

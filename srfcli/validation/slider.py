@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -274,8 +274,7 @@ class Plan:
 FASTEST_SLIP = 60.0  # of ln(v/V0): what a solver's trial step may ask for is kept finite
 
 
-@dataclass(frozen=True)
-class Felt:
+class Felt(NamedTuple):  # a run makes a hundred thousand of them
     """The load at the asperities and its rate, N and N/s, beside the imposed one, its W - W0 and its rate."""
 
     W: float
@@ -572,10 +571,10 @@ class Slider:
             late = y[self._delay]
             rate = (felt.W - late) / p.memory_tau
             W = felt.W + p.memory * (late - felt.W)
-            felt = replace(felt, W=W, rate=felt.rate + p.memory * (rate - felt.rate))
+            felt = felt._replace(W=W, rate=felt.rate + p.memory * (rate - felt.rate))
         if self._servo:
             W, rate = y[self._servo], y[self._servo + 1]
-            felt = replace(felt, W=felt.W + p.servo * (W - felt.W), rate=felt.rate + p.servo * (rate - felt.rate))
+            felt = felt._replace(W=felt.W + p.servo * (W - felt.W), rate=felt.rate + p.servo * (rate - felt.rate))
         m, a = self._terms(t, y[self._age + 1], y[self._age], y[self._age2] if self._age2 else 0.0, felt.W)
         K = p.spring_under(felt.imposed)
         return self.contact.slide(y, m, a, felt.W, -p.cross * felt.excess, K), felt
