@@ -114,12 +114,11 @@ def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[M
     surface = _place(interface.text(), node) if interface else "elastic"
     parameters: list[Parameter] = []
     with law.blamed():
-        parameters += registry.get("friction", names[0]).parameters
+        parameters += registry.parameters("friction", names[0])
     with ageing.blamed():
-        base, modifiers = registry.ageing(names[1])
-        parameters += [p for each in (base, *modifiers) for p in each.parameters]
+        parameters += registry.ageing_parameters(names[1])
     with (interface or node).blamed():
-        parameters += registry.get("interface", surface).parameters
+        parameters += registry.parameters("interface", surface)
     moving = apparatus.mass is not None
     if inertia and inertia.boolean() and not moving:
         inertia.fail("inertia without a mass", 'Give [apparatus] mass = "2.37 kg", or inertia = false.')

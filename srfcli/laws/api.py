@@ -22,16 +22,10 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
-
-import sympy
-from sympy import LambertW as lambertw
-from sympy import asinh, atan, cos, cosh, exp, log, sin, sinh, sqrt, tanh
+from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
-from srfcli.laws.effect_file import SCANNED_VALUES, SLOTS, check_names, finished, known_names
-from srfcli.laws.expression import FUNCTIONS, expm1, log1p, symbol
 from srfcli.laws.law_file import (
     AGEING_SYMBOLS,
     COMMON,
@@ -45,11 +39,28 @@ from srfcli.laws.law_file import (
 )
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Check, Effect, ExtraState, FrictionLaw, Interface, Reader, Source, State
 
+if TYPE_CHECKING:
+    import sympy
+    from sympy import LambertW as lambertw
+    from sympy import asinh, atan, cos, cosh, exp, log, sin, sinh, sqrt, tanh
+
+    from srfcli.laws.expression import expm1, log1p
+
 __all__ = [
     "AgeingLaw", "AgeingModifier", "Check", "Effect", "ExtraState", "FrictionLaw", "Interface", "Parameter", "Reader", "Source",
     "SrfError", "State", "ageing_law", "asinh", "atan", "cos", "cosh", "effect", "exp", "expm1", "friction_law", "interface",
     "lambertw", "log", "log1p", "modifier", "reader", "sin", "sinh", "sqrt", "tanh",
 ]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Return a function of formulas, from sympy, which a reader of data files has no use for."""
+    if name in __all__:
+        from srfcli.laws.expression import FUNCTIONS
+
+        return FUNCTIONS[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 Parameters = Iterable[Parameter] | Mapping[str, Parameter]
 
@@ -61,6 +72,8 @@ class Symbols:
         self._names = tuple(names)
 
     def __getitem__(self, name: str) -> sympy.Symbol:
+        from srfcli.laws.expression import symbol
+
         if name not in self._names:
             raise SrfError(f"unknown parameter '{name}'", did_you_mean(name, self._names))
         return symbol(name)
@@ -143,6 +156,8 @@ def effect(
     holds, under the name of each, an `ExtraState`. `wrong` and `remedy` are what a report says where it is found.
     """
 
+    from srfcli.laws.effect_file import SCANNED_VALUES, SLOTS, check_names, finished, known_names
+
     def decorate(function: Callable[..., Any]) -> Effect:
         own = _name(function, name, "effect", "my-effect")
         listed, brought, needed = _parameter_list(parameters), tuple(states), tuple(needs)
@@ -216,6 +231,8 @@ def _told(function: Callable[..., Any], about: str) -> dict[str, Any]:
 
 def _called(function: Callable[..., Any], variables: list[str], parameters: tuple[str, ...]) -> Any:
     """Return the result of a function called with symbols: some of `variables` by name, and p, the `parameters`."""
+    from srfcli.laws.expression import symbol
+
     arguments: dict[str, Any] = {}
     for argument in inspect.signature(function).parameters:
         if argument != "p" and argument not in variables:
@@ -237,6 +254,8 @@ def _changes(
     function: Callable[..., Any], parameters: Iterable[str], known: tuple[str, ...], states: tuple[str, ...]
 ) -> tuple[tuple[tuple[str, sympy.Expr], ...], tuple[ExtraState, ...]]:
     """Return the formula that an effect's function gives for each slot, and the unknowns that it adds."""
+    from srfcli.laws.effect_file import SLOTS
+
     where, own, variables = function.__name__, tuple(parameters), [n for n in known if n not in tuple(parameters)]
     result = _called(function, variables, own)
     if not isinstance(result, Mapping):
@@ -261,6 +280,10 @@ def _changes(
 
 def _exact(where: str, result: Any, known: tuple[str, ...]) -> sympy.Expr:
     """Return a formula with its floats as exact decimals, after the same whitelist as the text form's."""
+    import sympy
+
+    from srfcli.laws.expression import FUNCTIONS, symbol
+
     if not isinstance(result, sympy.Expr | int | float):
         raise SrfError(f"{where}: returned {type(result).__name__}, expected a formula", "Return one expression.")
     expr = sympy.sympify(result)  # an expression or a number already: no text gets here

@@ -24,6 +24,7 @@ from typing import Any
 from srfcli.core.cache import header_key, known_headers, user_base
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import check_plain, open_plain, read_plain
+from srfcli.core.settings import Parameter
 from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, read_header, read_toml, valid_name
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, Law, Reader
 
@@ -136,22 +137,29 @@ class Registry:
 
     def ageing(self, spelling: str) -> tuple[AgeingLaw, tuple[AgeingModifier, ...]]:
         """Return the ageing law and the modifiers of a spelling such as `dieterich+linker-dieterich`."""
-        first, *rest = (word.strip() for word in spelling.split("+"))
-        if not first or not all(rest):
-            raise SrfError(f"ageing law '{spelling}' has an empty part", "Write dieterich+linker-dieterich.")
-        if len(set(rest)) != len(rest):
-            raise SrfError(f"ageing law '{spelling}' names a modifier twice", "Change the modifier's parameter instead.")
+        self.ageing_parameters(spelling)
+        first, *rest = _ageing_words(spelling)
         law = self.get("ageing", first)
         modifiers = tuple(self.get("modifier", word) for word in rest)
         assert isinstance(law, AgeingLaw)
-        own = {p.name for p in law.parameters}
-        for m in modifiers:
-            assert isinstance(m, AgeingModifier)
-            for p in m.parameters:
-                if p.name in own:
-                    raise SrfError(f"'{spelling}' has two parameters called '{p.name}'", f"Rename the one of '{m.name}'.")
-                own.add(p.name)
         return law, modifiers  # type: ignore[return-value]
+
+    def ageing_parameters(self, spelling: str) -> tuple[Parameter, ...]:
+        """Return the parameters of an ageing law and its modifiers; SrfError where two are called alike."""
+        first, *rest = _ageing_words(spelling)
+        found = self.parameters("ageing", first)
+        for word in rest:
+            for p in (more := self.parameters("modifier", word)):
+                if p.name in (own.name for own in found):
+                    raise SrfError(f"'{spelling}' has two parameters called '{p.name}'", f"Rename the one of '{word}'.")
+            found += more
+        return found
+
+    def parameters(self, kind: str, name: str) -> tuple[Parameter, ...]:
+        """Return the parameters of a law; of one that is shipped the formula is not read for them."""
+        if not name.endswith((".toml", ".py")) and (entry := self.find(kind, name)).origin == BUNDLED:
+            return LawReader(entry.location, read_toml(entry.location)).parameters()
+        return self.get(kind, name).parameters
 
     def fingerprint(self, entry: Entry) -> str:
         """Return the sha256 of the file that holds a law."""
@@ -166,6 +174,16 @@ def chosen_instead(effect: Effect, model: str = "", apparatus: str = "") -> list
     instead = [f"{key} = {str(value).lower()}{model}" for key, value in effect.settings]
     freed = {"K": f"another stiffness{apparatus}", "M": f"a mass{apparatus}"}
     return instead + [freed.get(name, name) for name in effect.frees]
+
+
+def _ageing_words(spelling: str) -> list[str]:
+    """Return the names of an ageing law and its modifiers."""
+    words = [word.strip() for word in spelling.split("+")]
+    if not all(words):
+        raise SrfError(f"ageing law '{spelling}' has an empty part", "Write dieterich+linker-dieterich.")
+    if len(set(words[1:])) != len(words[1:]):
+        raise SrfError(f"ageing law '{spelling}' names a modifier twice", "Change the modifier's parameter instead.")
+    return words
 
 
 def _what(kind: str) -> str:
