@@ -251,10 +251,12 @@ def inner_grid(effect: Effect) -> list[dict[str, float]]:
         p = bounds[name]
         low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
         if name == "phase":
-            axes.append([(name, v) for v in np.linspace(0.0, np.pi, count, endpoint=False).tolist()])
+            spaced = np.linspace(0.0, np.pi, count, endpoint=False)
+        elif "phase" in bounds and low > 0:  # a wave's length: a recording resolves wavenumbers evenly
+            spaced = 1 / np.linspace(1 / high, 1 / low, count)
         else:
             spaced = np.geomspace(low, high, count) if low > 0 else np.linspace(max(low, 0.0), high, count)
-            axes.append([(name, v) for v in spaced.tolist()])
+        axes.append([(name, v) for v in spaced.tolist()])
     return [dict(combination) for combination in product(*axes)]
 
 

@@ -29,7 +29,7 @@ from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns,
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 
-ALIKE = 0.97  # likeness of two effects' projected columns beyond which they are one class
+RESEMBLING = 0.9  # likeness of two effects' projected columns beyond which one is tried in the place of the other: a fit decides
 NODES, MOST_NODES = 0.4, 400  # of a shared field: correlation lengths between them; how many
 NO_COLUMN = 1e-100  # of a column's squares: a bump beyond the ends of all runs, say
 COLUMNS_TOGETHER = 32  # columns that are projected at a time
@@ -430,7 +430,7 @@ class Scores:
         least: dict[str, tuple[float, _Column]] = {}
         for column in self.columns:
             share = column.tolerance / max(left.get((column.effect.name, *column.inner.items()), 0.0), 1e-300)
-            if share < least.get(column.effect.name, (1 - ALIKE**2,))[0]:
+            if share < least.get(column.effect.name, (1 - RESEMBLING**2,))[0]:
                 least[column.effect.name] = share, column
         return [self._score(column) for _, column in least.values()]
 

@@ -26,7 +26,7 @@ from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import loudness, shortcomings, taken_up, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
-from srfcli.diagnosis.scores import ALIKE, Remainder, Score, Scores, may_befall_one_run
+from srfcli.diagnosis.scores import RESEMBLING, Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
     CLOSE_CALL,
@@ -497,7 +497,7 @@ class ModelSearch:
             return
         for other in self.queue:
             own = other.direction
-            if own is not None and own.size == move.direction.size and abs(float(own @ move.direction)) > ALIKE:
+            if own is not None and own.size == move.direction.size and abs(float(own @ move.direction)) > RESEMBLING:
                 other.expected -= surprise
         heapq.heapify(self.queue)
 

@@ -15,7 +15,7 @@ from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import BETWEEN_SAMPLES, Experiment, Run, told_of_runs
 from srfcli.diagnosis.goodness_of_fit import improbability, loudness, shortcomings, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, typical_sizes
-from srfcli.diagnosis.scores import ALIKE, Remainder, Score, own_values
+from srfcli.diagnosis.scores import Remainder, Score, own_values
 from srfcli.diagnosis.search import CLOSE, NEAR, SEARCH_RTOL, WORTH, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
 from srfcli.inference.state_space import (
@@ -31,6 +31,7 @@ from srfcli.inference.state_space import (
 BASELINE_VERDICTS = ("none", "inconclusive")  # verdicts whose final model is the baseline
 HELD_OUT_RMS = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
 ABSORBED_SHARE = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
+ALIKE = 0.97  # likeness of two effects' projected columns beyond which they are one class
 BEHIND = 50.0  # in log evidence, by how much a model may be behind and still be asked what it predicts
 LACKING = 40.0  # in log evidence, what a model that fails a test loses in the stated confidence
 # the likeliest shares of the last 109 sealed cases (benchmarks/calibration.py): of something else being concealed where a model
