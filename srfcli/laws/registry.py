@@ -137,28 +137,24 @@ class Registry:
 
     def ageing(self, spelling: str) -> tuple[AgeingLaw, tuple[AgeingModifier, ...]]:
         """Return the ageing law and the modifiers of a spelling such as `dieterich+linker-dieterich`."""
-        self.ageing_parameters(spelling)
         first, *rest = _ageing_words(spelling)
-        law = self.get("ageing", first)
-        modifiers = tuple(self.get("modifier", word) for word in rest)
+        law, modifiers = self.get("ageing", first), tuple(self.get("modifier", word) for word in rest)
         assert isinstance(law, AgeingLaw)
+        _joined(spelling, [(m.name, m.parameters) for m in (law, *modifiers)])
         return law, modifiers  # type: ignore[return-value]
 
     def ageing_parameters(self, spelling: str) -> tuple[Parameter, ...]:
         """Return the parameters of an ageing law and its modifiers; SrfError where two are called alike."""
         first, *rest = _ageing_words(spelling)
-        found = self.parameters("ageing", first)
-        for word in rest:
-            for p in (more := self.parameters("modifier", word)):
-                if p.name in (own.name for own in found):
-                    raise SrfError(f"'{spelling}' has two parameters called '{p.name}'", f"Rename the one of '{word}'.")
-            found += more
-        return found
+        own = [(first, self.parameters("ageing", first)), *((word, self.parameters("modifier", word)) for word in rest)]
+        return _joined(spelling, own)
 
     def parameters(self, kind: str, name: str) -> tuple[Parameter, ...]:
         """Return the parameters of a law; of one that is shipped the formula is not read for them."""
-        if not name.endswith((".toml", ".py")) and (entry := self.find(kind, name)).origin == BUNDLED:
-            return LawReader(entry.location, read_toml(entry.location)).parameters()
+        if not name.endswith((".toml", ".py")):
+            entry = self.find(kind, name)
+            if entry.origin == BUNDLED and entry.location.suffix == ".toml":
+                return LawReader(entry.location, read_toml(entry.location)).parameters()
         return self.get(kind, name).parameters
 
     def fingerprint(self, entry: Entry) -> str:
@@ -184,6 +180,16 @@ def _ageing_words(spelling: str) -> list[str]:
     if len(set(words[1:])) != len(words[1:]):
         raise SrfError(f"ageing law '{spelling}' names a modifier twice", "Change the modifier's parameter instead.")
     return words
+
+
+def _joined(spelling: str, parts: Iterable[tuple[str, tuple[Parameter, ...]]]) -> tuple[Parameter, ...]:
+    """Return the parameters of an ageing law and its modifiers, given with their names."""
+    found: tuple[Parameter, ...] = ()
+    for name, parameters in parts:
+        if twice := {p.name for p in found} & {p.name for p in parameters}:
+            raise SrfError(f"'{spelling}' has two parameters called '{min(twice)}'", f"Rename the one of '{name}'.")
+        found += parameters
+    return found
 
 
 def _what(kind: str) -> str:
