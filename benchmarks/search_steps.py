@@ -26,7 +26,7 @@ from ablations import STEPS
 from common import Report
 from marked import marked
 
-from srfcli.diagnosis.search import Fitted, ModelSearch
+from srfcli.diagnosis.search import CLOSE, Fitted, ModelSearch
 from srfcli.validation.blind import Answer, diagnose_case
 from srfcli.validation.trials import answer_all, begin, open_truths
 
@@ -40,7 +40,7 @@ class Traced(ModelSearch):
         super().__init__(*given, **options)
         self.steps, self.since = [OTHER], time.process_time()
         self.cpu, self.taken, self.fits = Counter[str](), Counter[str](), Counter[str]()
-        self.asked: dict[int, tuple[str, Any]] = {}  # by which step a move was pushed, and the move
+        self.asked: dict[int, str] = {}  # by which step a move was pushed, by its number
         self.found: dict[str, str] = {}  # by which step a model was found
 
     @contextmanager
@@ -60,12 +60,12 @@ class Traced(ModelSearch):
         self.since = now
 
     def _push(self, moves: Sequence[Any]) -> None:
-        self.asked |= {id(move): (self.steps[-1], move) for move in moves}
+        self.asked |= {move.number: self.steps[-1] for move in moves}
         super()._push(moves)
 
     def fit(self, move: Any) -> Fitted:
         """Return a model fitted; it is that of the step which asked for it, now or before."""
-        step, _ = self.asked.get(id(move), (self.steps[-1], None))
+        step = self.asked.get(move.number if move else 0, self.steps[-1])
         self.fits[step] += 1
         found = super().fit(move)
         if found.name not in self.fitted or found.separate > self.fitted[found.name].separate:
@@ -75,7 +75,7 @@ class Traced(ModelSearch):
     def trace(self) -> dict[str, Any]:
         """Return what is kept of a search that has ended."""
         self._charge()
-        close = [f for f in self.ranked() if f.evidence > self.best().evidence - 6.0]
+        close = [f for f in self.ranked() if f.evidence > self.best().evidence - CLOSE]
         return {
             "best": self.best().name, "by": self.found.get(self.best().name, OTHER),
             "close": {f.name: self.found.get(f.name, OTHER) for f in close},

@@ -16,6 +16,7 @@ from srfcli.cli.main import cli
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import conclude
 from srfcli.laws.registry import load_registry
+from srfcli.results.diagnosis import DiagnosisResult
 
 RIG = ("--law", "dieterich-ruina", "--interface", "rigid", "--no-inertia", "--K", "0.1 N/um", "--W0", "10")
 LAW = ("--set", "mu0=0.6", "--set", "A=0.008", "--set", "B=0.011", "--set", "D0=5")
@@ -134,13 +135,18 @@ def test_a_line_that_coloured_noise_hides_at_one_lag_is_found(tmp_path: Path) ->
     assert frequency == pytest.approx(3.1, rel=0.03) and 0.004 < size < 0.03
 
 
-def test_the_pitch_of_a_screw_is_found_along_many_turns_of_it(tmp_path: Path) -> None:
-    """Thirty-one turns at one velocity, thirty-eight in the run; neither the pitch nor that anything ripples is stated."""
-    ripple = ("--effect", "drive-ripple", "--set", "amplitude=0.2", "--set", "pitch=11.5")
-    description = record(tmp_path / "run", *ripple, drive="90:4,20:1,5:12")
+def of_a_rippling_drive(out: Path, amplitude: float, drive: str) -> DiagnosisResult:
+    """A diagnosis of a recording whose drive ripples every 11.5 um, which is not stated."""
+    ripple = ("--effect", "drive-ripple", "--set", f"amplitude={amplitude}", "--set", "pitch=11.5")
+    description = record(out, *ripple, drive=drive)
     text = re.sub(r"^(effects|amplitude|pitch|phase) = .*\n", "", description.read_text(), flags=re.MULTILINE)
     description.write_text(text)
-    found = srfcli.diagnose(tmp_path / "run", effects=["drive-ripple", "track-topography", "friction-drift"])
+    return srfcli.diagnose(out, effects=["drive-ripple", "track-topography", "friction-drift"])
+
+
+def test_the_pitch_of_a_screw_is_found_along_many_turns_of_it(tmp_path: Path) -> None:
+    """Thirty-one turns at one velocity, thirty-eight in the run; neither the pitch nor that anything ripples is stated."""
+    found = of_a_rippling_drive(tmp_path / "run", amplitude=0.2, drive="90:4,20:1,5:12")
     assert (found.verdict, found.effects) == ("identified", ("drive-ripple",))
     pitch = found.answer["augmented"]["parameters"]["pitch"]
     assert pitch["value"] == pytest.approx(11.5, abs=4 * pitch["stderr"]) and pitch["stderr"] < 0.1
@@ -148,11 +154,7 @@ def test_the_pitch_of_a_screw_is_found_along_many_turns_of_it(tmp_path: Path) ->
 
 def test_a_rival_that_resembles_what_promises_most_is_fitted(tmp_path: Path) -> None:
     """A ripple of the stage is much like a topography of the track, which promises more at first order, and less likely."""
-    ripple = ("--effect", "drive-ripple", "--set", "amplitude=0.1", "--set", "pitch=11.5")
-    description = record(tmp_path / "run", *ripple, drive="60:4,15:12")
-    text = re.sub(r"^(effects|amplitude|pitch|phase) = .*\n", "", description.read_text(), flags=re.MULTILINE)
-    description.write_text(text)
-    found = srfcli.diagnose(tmp_path / "run", effects=["drive-ripple", "track-topography", "friction-drift"])
+    found = of_a_rippling_drive(tmp_path / "run", amplitude=0.1, drive="60:4,15:12")
     assert "drive-ripple" in found.effects and found.verdict in ("identified", "ambiguous")
 
 

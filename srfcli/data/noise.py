@@ -301,17 +301,16 @@ def ar1(n: int, lag1: float, *, rng: np.random.Generator) -> Array:
     if not lag1 or not n:
         return white
     white[1:] *= math.sqrt(1 - lag1 * lag1)  # the first sample has no predecessor and the same variance
-    return _carried(lag1, white)
+    return carried(lag1, white)
 
 
-def _carried(carry: float, added: Array, before: float = 0.0) -> Array:
+def carried(carry: float, added: Array, before: float = 0.0) -> Array:
     """Return y (n,) with y[k] = carry y[k-1] + added[k], where y[-1] = before, for n > 0."""
-    from scipy.linalg import solve_banded  # lfilter does the same, and scipy.signal takes longer to import than all else here
+    from scipy.linalg.lapack import dtbtrs  # lfilter does the same, and scipy.signal takes longer to import than all else here
 
-    bands = np.ones((2, added.size))
-    bands[1] = -carry
+    band = np.array([[1.0], [-carry]]) * np.ones(added.size)
     start = np.concatenate([[added[0] + carry * before], added[1:]])
-    return np.asarray(solve_banded((1, 0), bands, start, overwrite_ab=True, overwrite_b=True, check_finite=False))
+    return np.asarray(dtbtrs(band, start[:, None], uplo="L")[0][:, 0])
 
 
 def quantised(values: Array, quantum: float) -> Array:
@@ -404,6 +403,6 @@ class FrictionField:
         spread = math.sqrt(2 * one)
         shared, own = two / spread, math.sqrt(three - two * two / (2 * one))
         draws = rng.standard_normal((count, 2))
-        states = _carried(carry, spread * draws[:, 0], state)
+        states = carried(carry, spread * draws[:, 0], state)
         pushed = carry * a * np.concatenate([[state], states[:-1]]) + shared * draws[:, 0] + own * draws[:, 1]
-        return _carried(carry, pushed, value)
+        return carried(carry, pushed, value)

@@ -22,14 +22,13 @@ from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from scipy.linalg.lapack import dtbtrs
 from scipy.special import erfcx
 
 from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.data.gauge import CORRELATION_TIMES, FASTEST_OSCILLATION, PROCESSES, QUALITIES, QUALITY
-from srfcli.data.noise import calm_level
+from srfcli.data.noise import calm_level, carried
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, inverse
@@ -1546,17 +1545,10 @@ def correlated(point: Point) -> float:
     for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
         product, square = 0.0, 0.0
         for white in (np.clip(w, -5.0, 5.0) for f in point.runs for w in f.parts):
-            before = _faded(white, np.exp(-1.0 / span))
+            before = carried(float(np.exp(-1.0 / span)), np.concatenate([[0.0], white[:-1]]))
             product, square = product + float(white @ before), square + float(before @ before)
         worst = max(worst, abs(product) / np.sqrt(square) if square else 0.0)
     return worst
-
-
-def _faded(white: Array, carry: float) -> Array:
-    """Return the sum (n,) of the samples (n,) before each, each `carry` times the weight of the next one."""
-    band = np.array([[1.0], [-carry]]) * np.ones(white.size)
-    before = np.concatenate([[0.0], white[:-1]])
-    return np.asarray(dtbtrs(band, before[:, None], uplo="L")[0][:, 0])
 
 
 def steadily_coloured(found: StateSpaceFit, cautious: bool = False) -> bool:
