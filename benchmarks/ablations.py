@@ -77,7 +77,7 @@ class WithoutProjection(ModelSearch):
 
 STEPS = {  # a step: the method that is left out
     "another-ageing-law-near-by": "_try_ageing_laws",
-    "another-ageing-law-from-the-file": "_try_laws_afresh",
+    "from-the-file": "_fit_afresh",
     "scores-without-field": "_expand_without_field",
     "noise-of-each-run": "_with_own_noise",
     "all-noise": "_refit_noise",

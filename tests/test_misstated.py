@@ -202,3 +202,39 @@ def test_a_declared_modulation_counts_between_samples_that_are_too_few_for_it(tm
         assert abs(row["value"] - true) < 4 * row["stderr"] < 0.1 * true, row
     restated(tmp_path / "run" / "experiment.toml", ("frequency = 120.0", "frequency = 117.0"))
     assert "fewer than 8 samples a period of 117 Hz do not show the load between them" in srf("check", tmp_path / "run").output
+
+
+STEPPING = ("--law", "dieterich-ruina", "--interface", "rigid", "--no-inertia", "--K", "0.025 N/um", "--drive", "60:8",
+            "--load", "15:22,15:27,15:22,15:31", "--load-rise", 2)  # fmt: skip
+STATED = {"mu0": (0.58, 0.3, 0.9), "A": (0.008, 0.002, 0.03), "B": (0.009, 0.001, 0.04), "D0": (22.0, 2.0, 200.0)}
+
+
+@pytest.fixture(scope="module")
+def contacts_that_a_load_renews(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A slider under steps of load to which the contacts' age answers, as it is not stated; start values are far off."""
+    out = tmp_path_factory.mktemp("renewed") / "recording"
+    true = [part for value in ("mu0=0.67", "A=0.0055", "B=0.0026", "D0=16", "alpha=0.155") for part in ("--set", value)]
+    srf("simulate", *STEPPING, "--effect", "linker-dieterich", *true, "--rate", 10, *GAUGE, "--out-dir", out)
+    description = out / "experiment.toml"
+    text = re.sub(r"(?m)^(effects|alpha) = .*\n", "", description.read_text())
+    for name, (value, low, high) in STATED.items():
+        text = re.sub(rf"(?m)^{name} = .*$", f"{name} = {{ value = {value}, lower = {low}, upper = {high} }}", text)
+    description.write_text(text)
+    return description
+
+
+def test_a_fit_does_not_end_where_a_wide_field_stands_for_what_load_steps_do(contacts_that_a_load_renews: Path) -> None:
+    description = contacts_that_a_load_renews.with_name("right.toml")
+    description.write_text(contacts_that_a_load_renews.read_text())
+    listed = ("[parameters]", "[parameters]\nalpha = {}")
+    restated(description, ("inertia = false", 'inertia = false\neffects = ["linker-dieterich"]'), listed)
+    found = srfcli.fit(description).found.fit
+    assert found.values["alpha"] == pytest.approx(0.155, abs=0.004), found.values
+    assert found.values["D0"] == pytest.approx(16.0, rel=0.1), found.values
+
+
+def test_an_effect_is_found_from_the_files_own_values_where_a_field_has_taken_it_up(contacts_that_a_load_renews: Path) -> None:
+    found = srfcli.diagnose(contacts_that_a_load_renews, effects=["linker-dieterich", "sensor-lag", "stiffness-error"])
+    assert (found.verdict, found.diagnosis.best.name) == ("identified", "linker-dieterich"), found.diagnosis.reasons
+    assert found.diagnosis.best.fit.values["alpha"] == pytest.approx(0.155, abs=0.004)
+    assert "linker-dieterich" not in {excluded.effect for excluded in found.diagnosis.not_identifiable}

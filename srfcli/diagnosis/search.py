@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from srfcli.codegen.model import Array
+from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import Experiment, Run
@@ -68,7 +68,8 @@ BUDGET = 300.0  # s of CPU, or more
 BASELINES = 5.0  # times what the baseline took, if that is more: two effects, each fitted twice, and what they leave to be scored
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 BUILT, BUILT_SPAN = 16, 1e3  # sizes of what is built in, a mass or an interface, that are tried; the largest over the least
-FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
+FEWEST = 3  # models that are led on from the file's start values, however many there are
+FOLLOWED = 0.1  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
 
 @dataclass(frozen=True)
@@ -180,6 +181,7 @@ class ModelSearch:
         self.queue: list[_Move] = []
         self.count = 0
         self._taken: set[tuple[Callable[[Fitted], Any], str]] = set()  # steps, and of which model
+        self._expected: dict[str, float] = {}  # the most that was expected of each effect beside the baseline
         self._tried: dict[str, Array] = {}  # from where each other ageing law was tried last
 
     def progress(self, text: str) -> None:
@@ -346,8 +348,8 @@ class ModelSearch:
                 if self._promising(base):  # what has been likelier, else what is expected to be
                     move = max(self.queue, key=lambda m: (max(m.reached, base.evidence), -m.expected))
                     self._fit_next(self._taken_out(move))
-                if self.best().name == base.name:
-                    self._take(self._try_laws_afresh, base)
+                if self.best().name == base.name or not self.best().passes:
+                    self._take(self._fit_afresh, base)
             elif not base.passes:
                 self._try_ageing_laws(self.best())
             self._ask(self._steps)
@@ -379,10 +381,10 @@ class ModelSearch:
         best, base = self.best(), self.baseline
         if best.passes:  # other laws are tried near it alone, unless field or noise are there to make up for a law
             masked = taken_up(base.fit) and best.random and not best.hypothesis.ageing
-            steps: list[_Step] = [(self._try_laws_afresh, base) if masked else (self._try_ageing_laws, best)]
+            steps: list[_Step] = [(self._fit_afresh, base) if masked else (self._try_ageing_laws, best)]
             steps += [(self._expand_without_field, base)]
         else:
-            steps = [*((self._refit_elsewhere, f) for f in (self._simplest(), best)), (self._try_laws_afresh, base)]
+            steps = [*((self._refit_elsewhere, f) for f in (self._simplest(), best)), (self._fit_afresh, base)]
             steps += [(self._try_ageing_laws, best)] if best.hypothesis.ageing else []
             steps += [(self._expand_without_field, f) for f in (base, best)]
             steps += [(self._with_own_noise, best), (self._refit_noise, best), (self._fit_what_waits, best)]
@@ -458,7 +460,10 @@ class ModelSearch:
             if not self._promising(best):
                 if not self._expandable(best):
                     break
-                self._expand(best)
+                if best.passes or (self._fit_afresh, self.baseline.name) in self._taken:
+                    self._expand(best)
+                else:
+                    self._take(self._fit_afresh, self.baseline)
                 continue
             self._fit_next(heapq.heappop(self.queue))
 
@@ -559,6 +564,9 @@ class ModelSearch:
     def _push(self, moves: Sequence[_Move]) -> None:
         for move in moves:
             heapq.heappush(self.queue, move)
+            for effect in move.hypothesis.effects if len(move.hypothesis.effects) == 1 else ():
+                name = effect.reported
+                self._expected[name] = max(-move.expected, self._expected.get(name, -np.inf))
 
     def _expand_without_field(self, node: Fitted) -> None:
         """Push what effects promise from a fit without field and colour, where these have taken up what the model lacks.
@@ -590,12 +598,7 @@ class ModelSearch:
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""
-        model, values = node.fit.likelihood.problem.model, values or node.fit.values
-        return tuple(
-            {p.name: values[long] for long, p in own_parameters(e, model).items() if long in values}
-            | {n: values[n] for n in e.frees if n in values}
-            for e in node.hypothesis.effects
-        )
+        return _sizes_of(node.hypothesis, node.fit.likelihood.problem.model, values or node.fit.values)
 
     def _likelihood(self, hypothesis: Hypothesis, node: Fitted, name: str) -> Likelihood | None:
         """Return the likelihood of a model beside a fitted one; what cannot be joined is left out, with the reason."""
@@ -785,43 +788,61 @@ class ModelSearch:
             return np.inf
         return likelihood.at(x, slopes=False).log_likelihood
 
-    def _try_laws_afresh(self, base: Fitted) -> None:
-        """Fit the other ageing laws, the file's own start values tried, too: an effect, or the field, may pass for another law.
+    def _fit_afresh(self, base: Fitted) -> None:
+        """Fit other ageing laws, and effects if the baseline fails a test, from the file's own start values.
 
-        A fit that has made up for a wrong law may stand where no step leads to the right one. The likeliest at the file's values
-        is fitted first, and none any more once one passes. What is far behind after a few steps, without coloured noise, is left:
-        behind another law, or behind a model that is better than the baseline.
+        A field, or noise, may stand for what is missing; the other parameters then end where no step leads to the right model.
+        What keeps a field no wider than one may be after a few steps is fitted at once, and the likeliest of the others then;
+        none any more once one passes.
         """
         best = self.best()
         if not self.experiment.runs:
             self._try_ageing_laws(best)
             return
-        begun = []
-        for hypothesis, beside in self._other_laws(best):
-            own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
-            start = (wide_starts(own, {}, self.progress) or starts_elsewhere(own, own.coordinates({}), self.progress))[0]
-            begun.append((own.at(start, slopes=False).log_likelihood, own, start, hypothesis, beside))
+        models = list(self._other_laws(best))
+        singles = [Hypothesis((effect,)) for effect in ([] if base.passes else self._joining(base))]
+        for single in sorted(singles, key=lambda h: (h.name in self.fitted, -self._expected.get(h.name, -np.inf))):
+            known, (effect,) = self.fitted.get(single.name), single.effects
+            likelihood = None if known and known.passes else self._likelihood(single, base, effect.reported)
+            models += [(single, likelihood)] if likelihood else []
         highest = self._without_colour(best) if best.name != base.name else -np.inf
-        for _, own, start, hypothesis, beside in sorted(begun, key=lambda b: -b[0]):
-            places = [near] if (near := self._near(hypothesis, beside)) else []
+        waiting: list[tuple[Hypothesis, Likelihood, Likelihood, Maximum]] = []
+        for hypothesis, beside in models:
+            own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
+            start = next(wide_starts(own, {}, self.progress), None)
+            start = starts_elsewhere(own, own.coordinates({}), self.progress)[0] if start is None else start
             found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
-            if found.away > 1.0 and found.point.log_likelihood > highest - HOPELESS:
-                found = maximise(own, found.point.x, close=1.0, progress=self.progress)
-            highest = max(highest, found.point.log_likelihood)
-            places.append((own, found))
-            if beside.processes and found.point.log_likelihood > highest - HOPELESS:
-                noise = {n: v for n, v in self.baseline.fit.values.items() if n.startswith("gauge_")}
-                x = beside.coordinates({**found.point.values, **noise})
-                places.append((beside, maximise(beside, x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)))
-            if not (move := self._law_move(hypothesis, *max(places, key=lambda p: p[1].point.log_likelihood))):
-                continue
+            waiting.append((hypothesis, beside, own, found))
+            if not taken_up(StateSpaceFit(own, found)):
+                highest = max(highest, self._lead_on(*waiting.pop(), highest))
+                if self.best().passes and self.best().hypothesis.reported:
+                    return
+        for trial in sorted(waiting, key=lambda w: -w[3].point.log_likelihood)[:FEWEST]:
+            highest = max(highest, self._lead_on(*trial, highest))
+            if self.best().passes and self.best().hypothesis.reported:
+                return
+
+    def _lead_on(self, hypothesis: Hypothesis, beside: Likelihood, own: Likelihood, found: Maximum, highest: float) -> float:
+        """Fit a model that was begun from the file's start values where that promises enough; return the likelihood it reached.
+
+        With coloured noise as that of the baseline, too. What is far behind the highest, without coloured noise, is left.
+        """
+        places = [near] if hypothesis.ageing and (near := self._near(hypothesis, beside)) else []
+        if found.away > 1.0 and found.point.log_likelihood > highest - HOPELESS:
+            found = maximise(own, found.point.x, close=1.0, progress=self.progress)
+        highest = max(highest, found.point.log_likelihood)
+        places.append((own, found))
+        if beside.processes and found.point.log_likelihood > highest - HOPELESS:
+            noise = {n: v for n, v in self.baseline.fit.values.items() if n.startswith("gauge_")}
+            x = beside.coordinates({**found.point.values, **noise})
+            places.append((beside, maximise(beside, x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)))
+        if move := self._led_to(hypothesis, *max(places, key=lambda p: p[1].point.log_likelihood)):
             best = self.best()
             if -move.expected > best.evidence - (CLOSE if best.passes else HOPELESS):
                 self._fit_next(move)
             else:
                 self._push([move])
-            if self.best().passes and self.best().hypothesis.ageing:
-                return
+        return found.point.log_likelihood
 
     def _without_colour(self, node: Fitted) -> float:
         """Return the log likelihood of a fitted model where its gauge noise is white."""
@@ -839,7 +860,7 @@ class ModelSearch:
         for number, (hypothesis, likelihood, found) in enumerate(sorted(reached, key=lambda r: -r[2].promised)):
             if number == 0 and found.away > 1.0:
                 found = maximise(likelihood, found.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
-            self._push([move] if (move := self._law_move(hypothesis, likelihood, found)) else [])
+            self._push([move] if (move := self._led_to(hypothesis, likelihood, found)) else [])
 
     def _other_laws(self, best: Fitted) -> list[tuple[Hypothesis, Likelihood]]:
         """Return the ageing laws that neither the baseline nor the best model has, each with its likelihood."""
@@ -859,16 +880,16 @@ class ModelSearch:
         self._tried[hypothesis.name] = x
         return likelihood, maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
 
-    def _law_move(self, hypothesis: Hypothesis, likelihood: Likelihood, found: Maximum) -> _Move | None:
-        """Return a model of another law that goes on from where it was led to; None where it promises too little."""
+    def _led_to(self, hypothesis: Hypothesis, likelihood: Likelihood, found: Maximum) -> _Move | None:
+        """Return a model of one part more, or another law, that goes on from there; None where it promises too little."""
         node = self.baseline
         if not found.promised > node.fit.log_likelihood + (WORTH if node.passes else -HOPELESS):
             return None
         self.count += 1
-        expected = found.promised - node.fit.log_likelihood + node.attainable
+        expected = found.promised - node.fit.log_likelihood + node.attainable + len(hypothesis.effects) * self._one_more
         bare = node.fit.likelihood.processes and not likelihood.processes  # its noise is to be estimated anew
         values = {n: v for n, v in found.point.values.items() if not (bare and n.startswith("gauge_"))}
-        return _Move(-expected, self.count, hypothesis, values, ())
+        return _Move(-expected, self.count, hypothesis, values, _sizes_of(hypothesis, likelihood.problem.model, values))
 
     def _in_all_runs(self, best: Fitted) -> None:
         """Fit the best model with its effects in all runs: the score of one run may have been misled by what was missing then."""
@@ -965,6 +986,15 @@ class ModelSearch:
     def best(self) -> Fitted:
         """Return the model with the best evidence."""
         return self.ranked()[0]
+
+
+def _sizes_of(hypothesis: Hypothesis, model: GeneratedModel, values: Mapping[str, float]) -> tuple[dict[str, float], ...]:
+    """Return the values of a model's effects, by the effects' own names."""
+    return tuple(
+        {p.name: values[long] for long, p in own_parameters(e, model).items() if long in values}
+        | {n: values[n] for n in e.frees if n in values}
+        for e in hypothesis.effects
+    )
 
 
 def _colours(values: Mapping[str, float]) -> list[str] | None:

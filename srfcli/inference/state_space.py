@@ -14,7 +14,7 @@ likelihoods are by Laplace's method: Kass and Raftery, JASA 90 (1995); Cauchy pr
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -51,9 +51,10 @@ Kind: TypeAlias = tuple[str, float, str]  # of gauge noise: an observable, the s
 FILTER_RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
-# A fit begins with the likeliest of nine fields: amplitudes over friction, lengths over the longest slip / LENGTHS_IN_SLIP
-WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
-FIELD_TRIES = 3  # of these fields, from which a fit begins anew where half of its steps ended far from a maximum
+# Fields under which a fit begins: amplitude over friction, length over the longest slip / LENGTHS_IN_SLIP. One after the other,
+# while none leads near a maximum under a field that is narrower than it was
+WIDE = ((0.01, 3.0), (0.01, 10.0), (0.003, 1.0), (0.3, 1.0))
+SHORT = (1.0, 0.25, 0.06)  # lengths of faint fields that are tried, over the same
 NOT_CONVERGED = 3.0  # standard errors from its maximum at which a fit is none
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
 LEAST_FIELD = 1e-6  # the least amplitude of a field, over the friction of the recordings
@@ -673,7 +674,7 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
     longest = max(float(r.t[-1] - r.t[0]) for r in runs)
     length = max(slid, 1e-6) / LENGTHS_IN_SLIP
     found: dict[Any, tuple[float, float, float]] = {
-        "field_amplitude": (WIDE[0] * friction, LEAST_FIELD * friction, 0.3 * friction),
+        "field_amplitude": (WIDE[0][0] * friction, LEAST_FIELD * friction, 0.3 * friction),
         "field_length": (length, length / 100, 10 * length),
     }
     for what in {s.observable for r in runs for s in r.signals}:
@@ -1234,25 +1235,29 @@ def _fitted(
     wide = likelihood(False, processes or ())
     fresh = "field_amplitude" not in start
 
-    def from_any(starts: Sequence[Array]) -> Maximum | None:
-        """Return the maximum from the first start that leads near one, or the likeliest that was reached from a few."""
+    def from_any(starts: Iterable[Array]) -> Maximum | None:
+        """Return the maximum from the first start that leads near one, or the likeliest that was reached from all.
+
+        Under a field that is no narrower than the start's the filter follows the recordings whatever the parameters are: these
+        may have drifted to where no step leads back, and another start is tried.
+        """
         found: Maximum | None = None
-        for x in starts[:FIELD_TRIES]:
+        at = wide.names.index("field_amplitude")
+        for x in starts:
             other = maximise(wide, x, steps=SCORING_STEPS // 2 if fresh else 12, close=1.0, progress=progress)
             if found is None or other.point.log_likelihood > found.point.log_likelihood:
                 found = other
-            if other.away < NOT_CONVERGED:
+            if other.away < NOT_CONVERGED and other.point.x[at] < x[at]:
                 break
         return found
 
     found = from_any(wide_starts(wide, start, progress))
     if found is None or (fresh and found.status is Status.INTEGRATION):
-        found = from_any(starts_elsewhere(wide, wide.coordinates(start), progress))
+        found = from_any(starts_elsewhere(wide, wide.coordinates(start), progress)[: len(WIDE)])
     assert found is not None
     if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
         found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
     if fresh and found.status is not Status.INTEGRATION:
-        found = _under_less(wide, found, start, progress)
         found = scan_narrow(wide, found.point, progress) or found
     best = StateSpaceFit(wide, found)
     if found.status is Status.INTEGRATION:
@@ -1399,7 +1404,7 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
     """
     x = begun.x.copy()
     amplitude = likelihood.names.index("field_amplitude")
-    x[amplitude] = max(x[amplitude], _under_field(likelihood, x, WIDE[0], SHORT[0])[amplitude])
+    x[amplitude] = max(x[amplitude], _under_field(likelihood, x, *WIDE[0])[amplitude])
     point, highest = likelihood.at(x), begun.log_likelihood + NEEDED
     if not np.isfinite(point.log_likelihood):
         return None
@@ -1785,38 +1790,19 @@ def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Arra
     return found
 
 
-def wide_starts(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> list[Array]:
-    """Return x at `start` under a few wide fields, the likeliest first: there the filter stays with the recording.
-
-    The widest is tried first, and what takes MOST_WORK times the steps of the likeliest so far is none.
-    """
+def wide_starts(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Iterator[Array]:
+    """Yield x at `start` under one wide field after the other, where the filter stays with the recordings."""
     x = rough.coordinates(start)
     if "field_amplitude" in start:
-        return [x]
+        yield x
+        return
     amplitude, length = (rough.names.index(n) for n in FIELD)
-    trials: list[Point] = []
-    for wide, short in product(reversed(WIDE), SHORT):
-        best = max(trials, key=lambda p: p.log_likelihood, default=None)
-        trial = rough.at(_under_field(rough, x, wide, short), slopes=False, like=best)
+    for wide, long in WIDE:
+        trial = rough.at(_under_field(rough, x, wide, long), slopes=False)
         field = f"field of {np.exp(trial.x[amplitude]):.2g} over {np.exp(trial.x[length]):.2g} um"
         progress(f"{field}: log likelihood {trial.log_likelihood:.1f}")
         if np.isfinite(trial.log_likelihood):
-            trials.append(trial)
-    return [trial.x for trial in sorted(trials, key=lambda p: -p.log_likelihood)]
-
-
-def _under_less(rough: Likelihood, found: Maximum, start: Mapping[str, float], progress: Callable[[str], None]) -> Maximum:
-    """Return the maximum from the start under the least of the wide fields where that is likelier than one of another kind.
-
-    That is a maximum under a field so wide that the filter follows the recording whatever the parameters are: these then drift to
-    their bounds, and no step leads back.
-    """
-    amplitude = rough.names.index("field_amplitude")
-    if found.point.x[amplitude] < _under_field(rough, found.point.x, WIDE[1], SHORT[0])[amplitude]:
-        return found
-    x = _under_field(rough, rough.coordinates(start), WIDE[0], SHORT[0])
-    other = maximise(rough, x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
-    return other if other.point.log_likelihood > found.point.log_likelihood + NEEDED else found
+            yield trial.x
 
 
 def starts_elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
@@ -1835,7 +1821,7 @@ def starts_elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None
         trial[:k] = rough.lower[:k] + share * (rough.upper - rough.lower)[:k]
         trial[levels] = np.where(rough.logarithmic[levels], np.log(seen), seen)
         trial = np.clip(trial, rough.lower, rough.upper)
-        trial = _under_field(rough, trial, WIDE[number % len(WIDE)], SHORT[number % 2])
+        trial = _under_field(rough, trial, *WIDE[number % len(WIDE)])
         found = rough.at(trial, slopes=False).log_likelihood
         progress(f"from elsewhere: log likelihood {found:.1f}")
         if np.isfinite(found):

@@ -19,7 +19,7 @@ from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import lag_one
 from srfcli.inference.posterior import not_quadratic
 from srfcli.inference.profile import FARTHER
-from srfcli.inference.state_space import WIDE as WIDE_FIELDS
+from srfcli.inference.state_space import WIDE as FIELDS_AT_FIRST
 from srfcli.inference.state_space import typical_friction
 from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
@@ -347,7 +347,7 @@ class FitResult(Result):
         if found.friction_field is not None:
             notes.append(str(found.friction_field))
         notes += self.against
-        if self._field_share > WIDE_FIELDS[1]:
+        if self._field_share > FIELDS_AT_FIRST[0][0]:
             notes.append(
                 "under so wide a field a recording is followed whatever the parameters are, and the maximum may be a wrong one: "
                 "try --starts 5, or start values nearer to what is known"
