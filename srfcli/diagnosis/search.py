@@ -323,7 +323,7 @@ class ModelSearch:
     @property
     def _one_more(self) -> float:
         """Return what an effect more is expected to cost in log evidence: its prior, and Occam's factor."""
-        return -float(np.log(2 * len(self.candidates))) - 3.0
+        return -float(np.log(2 * max(len(self.candidates), 1))) - 3.0
 
     @property
     def _rarer(self) -> float:
