@@ -73,18 +73,23 @@ def candidate(search: ModelSearch, name: str, truth: Any, run: str) -> Effect:
     return replace(found[0], run=run)
 
 
+def right_hypothesis(search: ModelSearch, concealed: dict[str, Any]) -> Hypothesis:
+    """Return the hypothesis that holds what is concealed; SrfError where it is not registered."""
+    laws, truth = [n for n in concealed["effects"] if n in search.laws], known_physics(concealed)
+    run = concealed.get("only") or ""
+    return Hypothesis(tuple(candidate(search, n, truth, run) for n in concealed["effects"] if n not in laws), "".join(laws))
+
+
 def fitted(folder: Path, concealed: dict[str, Any]) -> tuple[str, float, float, float, bool]:
     """Return the model that holds what is concealed, its log evidence and likelihood, `white`, whether it saw all readings."""
     registry, truth = bundled_registry(), known_physics(concealed)
     search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
-    laws = [n for n in concealed["effects"] if n in search.laws]
-    effects = [candidate(search, n, truth, concealed.get("only") or "") for n in concealed["effects"] if n not in laws]
-    hypothesis = Hypothesis(tuple(effects), "".join(laws))
+    hypothesis = right_hypothesis(search, concealed)
     problem = hypothesis.problem(registry, search.experiment)
     likelihood = Likelihood(problem, processes=PROCESSES.get(concealed["noise"], ("relaxation",)), rtol=RTOL)
     values, stated = likelihood.values(likelihood.start), known_physics(concealed, baseline=True)
     values |= {n: float(getattr(stated, LAWS[n])) for n in problem.names if n in LAWS and getattr(stated, LAWS[n])}
-    for effect in effects:
+    for effect in hypothesis.effects:
         longs = {p.name: long for long, p in own_parameters(effect, problem.model).items()}
         values |= {longs.get(name, name): float(value) for name, value in of_an_effect(effect, truth).items()}
     values |= {"field_amplitude": concealed["rough"], "field_length": truth.track.length}

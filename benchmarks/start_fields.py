@@ -20,31 +20,20 @@ from typing import Any
 
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
-from at_the_truth import candidate
+from at_the_truth import right_hypothesis
 from common import Report
 
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
-from srfcli.diagnosis.hypotheses import Hypothesis
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.inference.state_space import FIELD, NOT_CONVERGED, SCORING_STEPS, WIDE, Likelihood, maximise
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.cases import known_physics, unseal
+from srfcli.validation.cases import unseal
 
 FIELDS = (*WIDE, (0.03, 1.0), (0.03, 3.0), (0.02, 10.0), (0.01, 1.0), (0.003, 3.0), (0.003, 0.25))
 NEAR = 3.0  # in log likelihood
 RTOL = 1e-3  # of the integration, as in a search
-
-
 Found = dict[tuple[float, float], tuple[float, float, float, bool]]
-
-
-def right_model(search: ModelSearch, concealed: dict[str, Any]) -> Likelihood:
-    """Return the likelihood of the model that holds what is concealed; SrfError where it is not registered."""
-    laws = [n for n in concealed["effects"] if n in search.laws]
-    truth, run = known_physics(concealed), concealed.get("only") or ""
-    effects = tuple(candidate(search, n, truth, run) for n in concealed["effects"] if n not in laws)
-    return Likelihood(Hypothesis(effects, "".join(laws)).problem(search.registry, search.experiment), rtol=RTOL)
 
 
 def tried(case: tuple[Path, dict[str, Any]]) -> Found | str:
@@ -53,7 +42,7 @@ def tried(case: tuple[Path, dict[str, Any]]) -> Found | str:
     registry = bundled_registry()
     search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
     try:
-        likelihood = right_model(search, concealed)
+        likelihood = Likelihood(right_hypothesis(search, concealed).problem(registry, search.experiment), rtol=RTOL)
     except SrfError as error:
         return str(error)
     at = [likelihood.names.index(n) for n in FIELD]
@@ -108,13 +97,7 @@ def main() -> None:
                 missed += [] if own else [name]
             what = "+".join(concealed["effects"]) or "none"
             print(
-                folder.parents[1].name,
-                folder.name,
-                concealed["rig"],
-                concealed["protocol"],
-                what,
-                "missed by:",
-                missed,
+                f"{folder}: {concealed['rig']}, {concealed['protocol']}, {what}; missed by {', '.join(missed) or 'none'}",
                 flush=True,
             )
     report.say(f"{fitted} right models; amplitude over friction, length over a twentieth of the longest slip\n")

@@ -68,7 +68,7 @@ BUDGET = 300.0  # s of CPU, or more
 BASELINES = 5.0  # times what the baseline took, if that is more: two effects, each fitted twice, and what they leave to be scored
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 BUILT, BUILT_SPAN = 16, 1e3  # sizes of what is built in, a mass or an interface, that are tried; the largest over the least
-FEWEST = 3  # models that are led on from the file's start values, however many there are
+FEWEST = 3  # models that are fitted from the file's start values although none has a plausible field: the likeliest
 FOLLOWED = 0.1  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
 

@@ -176,7 +176,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     if search.cut_short:
         reasons.append(f"the search ended at its budget of {search.budget:.0f} s of CPU, with models left to fit")
     named = {n for f in close for n in f.hypothesis.reported}  # found all the same
-    apart = [e for e in search.excluded if e.effect not in search.fitted]  # it could be fitted, from another start
+    excluded = [e for e in search.excluded if e.effect not in search.fitted]  # one attempt may fail and another not
     absorbed = [
         Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.tolerance):.2f} % of it")
         for s in scores
@@ -185,7 +185,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     return Diagnosis(
         whole, verdict, best, baseline, baseline if verdict in BASELINE_VERDICTS else shown, ranked, close,
         _confidence(ranked, joint, became, verdict), scores,
-        tuple(dict.fromkeys((*apart, *absorbed))), {s.effect.reported: s.detectable for s in scores},
+        tuple(dict.fromkeys((*excluded, *absorbed))), {s.effect.reported: s.detectable for s in scores},
         _equivalent(scores, close, ranked, joint), held,
         tuple(reasons), ungated, held_loads, became,
     )  # fmt: skip
