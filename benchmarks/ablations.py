@@ -12,7 +12,7 @@ colour      the gauge's noise is white in every model
 projection  effects are scored by what they explain of the misfit alone: what parameters, field or gauge noise could explain as
             well is not taken off
 
-A step of the search, left out, is one of those of `srfcli.diagnosis.search.ModelSearch`:
+Steps of the search, joined by commas where several are left out, are those of `srfcli.diagnosis.search.ModelSearch`:
 
 {steps}
 
@@ -80,27 +80,26 @@ STEPS = {  # a step: the method that is left out
     "from-the-file": "_fit_afresh",
     "scores-without-field": "_expand_without_field",
     "noise-of-each-run": "_with_own_noise",
-    "all-noise": "_refit_noise",
-    "all-that-waits": "_fit_what_waits",
     "rivals": "_try_rivals",
-    "scans": "_scanned",
-    "sizes": "_resized",
     "all-runs": "_in_all_runs",
     "one-run": "_in_one_run",
     "elimination": "_eliminate",
-    "surprises": "_revise",
-    "failures": "_expect_elsewhere",
 }
 
 
-def without_step(name: str) -> type[ModelSearch]:
-    """Return the search without one of its steps."""
-    kept = (lambda self, node: node) if name == "noise-of-each-run" else (lambda self, *of: None)
-    return type("Without" + name.title().replace("-", ""), (ModelSearch,), {STEPS[name]: kept})
-
-
 PARTS: dict[str, type[ModelSearch]] = {"field": WithoutField, "colour": WithoutColour, "projection": WithoutProjection}
-PARTS |= {name: without_step(name) for name in STEPS}
+
+
+def without(parts: str) -> type[ModelSearch]:
+    """Return the search without a part, or without several of its steps, joined by commas; KeyError if there is no such."""
+    if parts in PARTS:
+        return PARTS[parts]
+    left = {STEPS[name]: (lambda self, *of: None) for name in parts.split(",")}
+    if "noise-of-each-run" in parts.split(","):
+        left[STEPS["noise-of-each-run"]] = lambda self, node: node
+    return type("Without", (ModelSearch,), left)
+
+
 __doc__ = (__doc__ or "").format(steps="\n".join(f"{name:34}{method}" for name, method in STEPS.items()))
 
 
@@ -111,8 +110,8 @@ def holding(name: str) -> list[ModuleType]:
 
 
 def diagnose_without(folder: Path, plugins: tuple[Path, ...], *, part: str) -> Answer:
-    """Return what the diagnosis says without a part or a step."""
-    return diagnose_case(folder, plugins, by=PARTS[part])
+    """Return what the diagnosis says without a part, or without steps."""
+    return diagnose_case(folder, plugins, by=without(part))
 
 
 def diagnose_with(folder: Path, plugins: tuple[Path, ...], *, constant: str) -> Answer:
@@ -156,7 +155,7 @@ def main() -> None:
     parser.add_argument("truths", type=Path)
     parser.add_argument("--beside", type=Path, required=True, help="answers.jsonl of the trial, marked beside")
     parser.add_argument("--known", type=Path, help="known.jsonl of the trial: what was visible")
-    parser.add_argument("--without", action="append", default=[], choices=sorted(PARTS), help="part to leave out")
+    parser.add_argument("--without", action="append", default=[], help="part, or steps joined by commas")
     parser.add_argument("--with", dest="constants", action="append", default=[], help="a constant and its value: WORTH=24")
     parser.add_argument("--cases", type=int, help="how many cases to take, from the first on")
     parser.add_argument("--quickest", type=int, help="how many of these to take, by the CPU of the whole diagnosis")
@@ -167,11 +166,14 @@ def main() -> None:
         name, _, value = constant.partition("=")
         if not holding(name) or not re.fullmatch(r"\d+(\.\d*)?", value):
             parser.error(f"--with {constant}: give a number of srfcli.diagnosis or srfcli.inference and its value, WORTH=24")
+    for parts in given.without:
+        if parts not in PARTS and not STEPS.keys() >= set(parts.split(",")):
+            parser.error(f"--without {parts}: give one of {', '.join(PARTS)}, or steps joined by commas: {', '.join(STEPS)}")
     whole = read_answers(given.beside)
     names = sorted(whole)[: given.cases]
     names = sorted(sorted(names, key=lambda n: whole[n].cpu)[: given.quickest])
     changes = [f"without {part}" for part in given.without] + [f"with {constant}" for constant in given.constants]
-    changes = changes or [f"without {part}" for part in sorted(PARTS)]
+    changes = changes or [f"without {part}" for part in (*PARTS, *STEPS)]
     found = {change: list(answered(given.bank, change, names, given.workers, given.kept)) for change in changes}
     truths = unseal(given.bank, given.truths)  # only now
     report = Report("ablations", __doc__ or "")

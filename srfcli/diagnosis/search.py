@@ -26,11 +26,10 @@ from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import loudness, shortcomings, taken_up, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
-from srfcli.diagnosis.scores import RESEMBLING, Remainder, Score, Scores, may_befall_one_run
+from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
     CLOSE_CALL,
-    DEVIATION,
     FARTHEST_STEP,
     FIELD,
     HOPELESS,
@@ -39,17 +38,14 @@ from srfcli.inference.state_space import (
     TRIAL_STEPS,
     Likelihood,
     Maximum,
-    Point,
     Predictive,
     StateSpaceFit,
-    correlated,
     fit_state_space,
     likeliest_beside,
     log_evidence,
     mass_at_bounds,
     maximise,
     processes_in,
-    scan_narrow,
     starts_elsewhere,
     thinned,
     wide_starts,
@@ -140,7 +136,6 @@ class _Move:
     sizes: tuple[dict[str, float], ...] = field(compare=False)
     least: float = field(compare=False, default=-np.inf)  # log likelihood from which it is worth a fit
     fresh: int = field(compare=False, default=0)  # how many of the last effects are at sizes that are only expected
-    direction: Array | None = field(compare=False, default=None)  # of what its last effect is expected to explain
     shifts: Mapping[str, float] = field(compare=False, default_factory=dict)  # of other parameters that go with that
     origin: StateSpaceFit | None = field(compare=False, default=None)  # whose parameters it begins with, as they are
     reached: float = field(compare=False, default=-np.inf)  # log evidence that was reached on the way to what is expected
@@ -384,21 +379,15 @@ class ModelSearch:
             steps: list[_Step] = [(self._fit_afresh, base) if masked else (self._try_ageing_laws, best)]
             steps += [(self._expand_without_field, base)]
         else:
-            steps = [*((self._refit_elsewhere, f) for f in (self._simplest(), best)), (self._fit_afresh, base)]
+            steps = [(self._fit_afresh, base)]
             steps += [(self._try_ageing_laws, best)] if best.hypothesis.ageing else []
             steps += [(self._expand_without_field, f) for f in (base, best)]
-            steps += [(self._with_own_noise, best), (self._refit_noise, best), (self._fit_what_waits, best)]
+            steps += [(self._with_own_noise, best)]
         return [*steps, (self._try_rivals, best), *self._simplifying()]
 
     def _simplifying(self) -> list[_Step]:
         """Return the steps that lead from the model that is the best now to others that are as simple, or simpler."""
-        simplest, steps = self._simplest(), (self._in_all_runs, self._in_one_run, self._eliminate)
-        return [*([] if simplest.passes else [(self._refit_elsewhere, simplest)]), *((step, self.best()) for step in steps)]
-
-    def _simplest(self) -> Fitted:
-        """Return the simplest of the models that come close to the best: the best's other parts may make up for its maximum."""
-        close = [f for f in self.ranked() if f.evidence > self.best().evidence - CLOSE]
-        return min(close, key=lambda f: len(f.hypothesis.reported))
+        return [(step, self.best()) for step in (self._in_all_runs, self._in_one_run, self._eliminate)]
 
     def _fit_all(self) -> None:
         """Fit the baseline, the best and what passes and comes close to it to all readings; the others were not."""
@@ -439,7 +428,7 @@ class ModelSearch:
         """Return whether a model that waits is expected to come close to the best."""
         if not self.queue:
             return False
-        if self.experiment.thresholds and not best.passes and self.queue[0].direction is not None:
+        if self.experiment.thresholds and not best.passes and self.queue[0].fresh:
             return True  # far off the first order promises too little
         return -self.queue[0].expected >= best.evidence - CLOSE
 
@@ -474,45 +463,18 @@ class ModelSearch:
             return
         self.progress(f"{name}: expected log evidence {-move.expected:.1f}, best {self.best().evidence:.1f}")
         try:
-            found = self._record(self.fit(move))
+            self._record(self.fit(move))
         except _Spent:
             heapq.heappush(self.queue, move)
             raise
         except SrfError as error:
             self.excluded.append(Excluded(name, error.message))
-            self._expect_elsewhere(move)
-            return
-        self._revise(move, found)
-
-    def _fit_what_waits(self, best: Fitted) -> None:
-        """Fit what waits, the simplest first, until one is the best: a model that fails a test is no measure of promises."""
-        while self.queue and not self.spent and self.best().name == best.name:
-            self._fit_next(self._taken_out(min(self.queue, key=lambda m: (len(m.hypothesis.reported), m.expected))))
 
     def _taken_out(self, move: _Move) -> _Move:
         """Return a move that waited, which no longer does."""
         self.queue = [other for other in self.queue if other is not move]
         heapq.heapify(self.queue)
         return move
-
-    def _revise(self, move: _Move, found: Fitted) -> None:
-        """Raise what is expected of effects that are like a fitted one at first order by what that gained beyond its promise."""
-        surprise = found.evidence + move.expected
-        if move.direction is None or surprise <= 0:
-            return
-        for other in self.queue:
-            own = other.direction
-            if own is not None and own.size == move.direction.size and abs(float(own @ move.direction)) > RESEMBLING:
-                other.expected -= surprise
-        heapq.heapify(self.queue)
-
-    def _expect_elsewhere(self, move: _Move) -> None:
-        """Expect of an effect that cannot be fitted beside one model as much beside the others that it was scored for."""
-        added = move.hypothesis.effects[-1:]
-        for other in self.queue:
-            if added and other.hypothesis.effects[-1:] == added:
-                other.expected = min(other.expected, move.expected)
-        heapq.heapify(self.queue)
 
     def _expand(self, node: Fitted) -> Fitted:
         """Push what a fitted model promises: one more effect, two at once, something built in, another ageing law."""
@@ -557,7 +519,7 @@ class ModelSearch:
             least_likely, fresh = at.fit.log_likelihood - HOPELESS, len(hypothesis.effects) - len(at.hypothesis.effects)
             moves.append(_Move(
                 -(node.attainable + gain + self._one_more), self.count, hypothesis, values, sizes, least_likely, fresh,
-                direction=score.direction, shifts=own,
+                shifts=own,
             ))  # fmt: skip
         return moves
 
@@ -637,56 +599,6 @@ class ModelSearch:
         sizes = (*self._sizes(node), {own[0]: values[own[0]]})
         without, reached = node.attainable + self._one_more, found.point.log_likelihood - node.fit.log_likelihood
         return _Move(-(without + gain), self.count, hypothesis, values, sizes, reached=without + reached)
-
-    def _refit_elsewhere(self, node: Fitted) -> None:
-        """Fit a model that fails a test anew where a scan, or another size of what is built in, leads somewhere likelier."""
-        if node.name == self.baseline.name:
-            return
-        found = self._scanned(node) or self._resized(node)
-        if found is not None and found.log_likelihood > node.fit.log_likelihood + NEEDED:
-            values = dict(found.values)
-            with contextlib.suppress(SrfError):  # else it stays as it was
-                self._record(self.fit(_Move(0.0, 0, node.hypothesis, values, self._sizes(node, values))))
-
-    def _scanned(self, node: Fitted) -> Point | None:
-        """Return the likeliest point that scans of parameters with narrow maxima lead to, None where it is no likelier."""
-        if not self.experiment.runs:
-            return None
-        likelihood = Likelihood(node.fit.likelihood.problem, processes=node.fit.likelihood.processes, rtol=SEARCH_RTOL)
-        begun = likelihood.at(likelihood.coordinates(_followable(node.fit.values, likelihood.problem)))
-        found = scan_narrow(likelihood, begun, self.progress)
-        return found.point if found and found.point.log_likelihood > node.fit.log_likelihood + NEEDED else None
-
-    def _resized(self, node: Fitted) -> Point | None:
-        """Return the likeliest point from other sizes of what is built in, the other parameters fitted under each.
-
-        So with the first of several inner parameters of an effect with states, as a frequency beside a damping; else None.
-        """
-        built = [n for e in node.hypothesis.effects if e.settings for n in (*(p.name for p in e.parameters), *e.frees)]
-        built += [e.scans[0][0] for e in node.hypothesis.effects if e.states and len(e.scans) > 1]
-        likelihood = node.fit.likelihood
-        name = next((n for n in likelihood.problem.names if n in built), None)
-        if name is None:
-            return None
-        trials, values = [], _followable(node.fit.values, likelihood.problem)
-        for ratio in BUILT_SPAN ** (np.arange(-4, 5) / 2 / (BUILT - 1)):  # two sizes to either side, by halves
-            y = likelihood.coordinates({**values, name: values[name] * ratio})
-            trials.append(
-                maximise(likelihood, y, held=[name], steps=TRIAL_STEPS // 2, close=1.0, widths=(), progress=self.progress)
-            )
-        likeliest = max(trials, key=lambda f: f.point.log_likelihood)
-        return maximise(likelihood, likeliest.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress).point
-
-    def _refit_noise(self, best: Fitted) -> None:
-        """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""
-        if "processes" in self.options or correlated(best.fit.maximum.point) < DEVIATION:
-            return
-        processes = self._refitted(best, None).fit.likelihood.processes
-        if processes != best.fit.likelihood.processes:
-            for node in {f.name: f for f in (self.baseline, *self.ranked()[:MOST_FOLLOWED])}.values():
-                if node.fit.likelihood.processes != processes:
-                    self._refitted(node, processes)
-            self.queue.clear()
 
     def _with_own_noise(self, node: Fitted) -> Fitted:
         """Return a fitted model with a gauge noise for each run, as all models have from then on, where runs differ in it.
