@@ -614,15 +614,16 @@ class ModelSearch:
         )  # fmt: skip
         self.fitted = dict(self.fitted)
         try:
-            problem, processes = self._problem(node.hypothesis, node.fit.values), node.fit.likelihood.processes
-            found = self._from_there(node, problem, processes)  # more processes are for what is left of the best model
+            found = self._from_there(node, self._problem(node.hypothesis, node.fit.values), node.fit.likelihood.processes)
             loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
             if loud or log_evidence(found) < log_evidence(node.fit) + CLOSE:
                 return node
             others = [f for f in (self.baseline, *self.ranked()[:MOST_FOLLOWED]) if f.name != node.name]
             self._record(self._judged(node.hypothesis, found), anew=True)
             for other in others:
-                self._refitted(other, found.likelihood.processes)
+                again = self._from_there(other, other.fit.likelihood.problem, found.likelihood.processes)
+                with contextlib.suppress(SrfError):  # else it stays as it was
+                    self._record(self._judged(other.hypothesis, again), anew=True)
             self.queue.clear()
             done = True
         finally:
@@ -630,18 +631,10 @@ class ModelSearch:
                 self.experiment, self.whole, self.fitted = before
         return self.fitted[node.name]
 
-    def _from_there(self, node: Fitted, problem: Problem, processes: Sequence[str] | None) -> StateSpaceFit:
-        """Return a fit of a problem from where a model stands, with coloured gauge noise as given, or as much as it wants."""
+    def _from_there(self, node: Fitted, problem: Problem, processes: Sequence[str]) -> StateSpaceFit:
+        """Return a fit of a problem from where a model stands, with coloured gauge noise as given."""
         start = _followable(node.fit.values, problem)
         return self._state_space(problem, start=start, **{**self.options, "processes": processes})
-
-    def _refitted(self, node: Fitted, processes: Sequence[str] | None) -> Fitted:
-        """Return a fitted model with other gauge noise, which takes its place."""
-        found = self._from_there(node, node.fit.likelihood.problem, processes)
-        try:
-            return self._record(self._judged(node.hypothesis, found), anew=True)
-        except SrfError:  # it stays as it was
-            return node
 
     def _try_rivals(self, best: Fitted) -> None:
         """Fit what does the same at first order in the place of one effect of the best model, or of its ageing law.
