@@ -96,7 +96,7 @@ def without(parts: str) -> type[ModelSearch]:
         return PARTS[parts]
     left = {STEPS[name]: (lambda self, *of: None) for name in parts.split(",")}
     if "noise-of-each-run" in parts.split(","):
-        left[STEPS["noise-of-each-run"]] = lambda self, node: node
+        left[STEPS["noise-of-each-run"]] = lambda self, base: base
     return type("Without", (ModelSearch,), left)
 
 

@@ -382,7 +382,6 @@ class ModelSearch:
             steps = [(self._fit_afresh, base)]
             steps += [(self._try_ageing_laws, best)] if best.hypothesis.ageing else []
             steps += [(self._expand_without_field, f) for f in (base, best)]
-            steps += [(self._with_own_noise, best)]
         return [*steps, (self._try_rivals, best), *self._simplifying()]
 
     def _simplifying(self) -> list[_Step]:
@@ -600,41 +599,25 @@ class ModelSearch:
         without, reached = node.attainable + self._one_more, found.point.log_likelihood - node.fit.log_likelihood
         return _Move(-(without + gain), self.count, hypothesis, values, sizes, reached=without + reached)
 
-    def _with_own_noise(self, node: Fitted) -> Fitted:
-        """Return a fitted model with a gauge noise for each run, as all models have from then on, where runs differ in it.
+    def _with_own_noise(self, base: Fitted) -> Fitted:
+        """Return the baseline with a gauge noise for each run, as all models have from then on, where runs differ in it.
 
         That is where one noise is too large for one run and too small for another, evidence rises, and none is louder then than
         its recording shows.
         """
-        if GAUGE_NOISE in self.experiment.vary or not uneven_noise(node.fit):
-            return node
-        before, done = (self.experiment, self.whole, self.fitted), False
-        self.experiment, self.whole = (
-            replace(e, vary=(*e.vary, GAUGE_NOISE), by=e.by if e.vary else "run") for e in before[:2]
-        )  # fmt: skip
-        self.fitted = dict(self.fitted)
-        try:
-            found = self._from_there(node, self._problem(node.hypothesis, node.fit.values), node.fit.likelihood.processes)
-            loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
-            if loud or log_evidence(found) < log_evidence(node.fit) + CLOSE:
-                return node
-            others = [f for f in (self.baseline, *self.ranked()[:MOST_FOLLOWED]) if f.name != node.name]
-            self._record(self._judged(node.hypothesis, found), anew=True)
-            for other in others:
-                again = self._from_there(other, other.fit.likelihood.problem, found.likelihood.processes)
-                with contextlib.suppress(SrfError):  # else it stays as it was
-                    self._record(self._judged(other.hypothesis, again), anew=True)
-            self.queue.clear()
-            done = True
-        finally:
-            if not done:
-                self.experiment, self.whole, self.fitted = before
-        return self.fitted[node.name]
-
-    def _from_there(self, node: Fitted, problem: Problem, processes: Sequence[str]) -> StateSpaceFit:
-        """Return a fit of a problem from where a model stands, with coloured gauge noise as given."""
-        start = _followable(node.fit.values, problem)
-        return self._state_space(problem, start=start, **{**self.options, "processes": processes})
+        if GAUGE_NOISE in self.experiment.vary or not uneven_noise(base.fit):
+            return base
+        experiment, whole = (
+            replace(e, vary=(*e.vary, GAUGE_NOISE), by=e.by if e.vary else "run") for e in (self.experiment, self.whole)
+        )
+        problem = base.hypothesis.problem(self.registry, experiment, at=base.fit.values, trend=self.trend)
+        options = {**self.options, "processes": base.fit.likelihood.processes}
+        found = self._state_space(problem, start=_followable(base.fit.values, problem), **options)
+        loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
+        if loud or log_evidence(found) < log_evidence(base.fit) + CLOSE:
+            return base
+        self.experiment, self.whole = experiment, whole
+        return self._record(self._judged(base.hypothesis, found))
 
     def _try_rivals(self, best: Fitted) -> None:
         """Fit what does the same at first order in the place of one effect of the best model, or of its ageing law.
@@ -861,13 +844,13 @@ class ModelSearch:
         """Return the parameters of the baseline's model."""
         return frozenset(Hypothesis().model(self.registry, self.experiment).names)
 
-    def _record(self, found: Fitted, *, anew: bool = False) -> Fitted:
+    def _record(self, found: Fitted) -> Fitted:
         name = found.name
         known = self.fitted.get(name)
         text = f"log evidence {found.separate:.1f}" + (f", but {found.against[0]}" if found.against else "")
         self.progress(f"{name}: {text}")
-        if known is None or anew or found.separate > known.separate:
-            same = known is not None and not anew and found.separate - known.separate < NEEDED
+        if known is None or found.separate > known.separate:
+            same = known is not None and found.separate - known.separate < NEEDED
             self.fitted[name] = replace(found, scores=known.scores) if known is not None and same else found
             self._grant_shared_field()
         return self.fitted[name]
