@@ -164,6 +164,42 @@ def test_files_say_what_they_are() -> None:
     assert not [n for n, p in files().items() if not ast.get_docstring(parsed(p))]
 
 
+def numbers(path: Path) -> Iterator[tuple[str, object]]:
+    """Yield the constants of a file that are numbers, or tuples of numbers, by their names."""
+    for node in parsed(path).body:
+        if not isinstance(node, ast.Assign):
+            continue
+        (target,) = node.targets
+        names = target.elts if isinstance(target, ast.Tuple) else [target]
+        try:
+            value = ast.literal_eval(node.value)
+        except ValueError:
+            continue
+        for name, own in zip(names, value if isinstance(target, ast.Tuple) else [value], strict=True):
+            parts = own if isinstance(own, tuple) else (own,)
+            if isinstance(name, ast.Name) and all(isinstance(x, int | float) for x in parts):
+                yield name.id, own
+
+
+def test_a_constant_means_the_same_everywhere() -> None:
+    """A number has one name in one file, from which others import it."""
+    found: dict[str, list[str]] = {}
+    for module, path in files().items():
+        for name, _ in numbers(path):
+            found.setdefault(name, []).append(module)
+    assert len(found) > 300 and not {name: places for name, places in found.items() if len(places) > 1}
+
+
+def test_constants_in_the_docs_are_those_of_the_code() -> None:
+    known = {name: value for path in files().values() for name, value in numbers(path)}
+    quoted = {
+        (page.name, name, float(value))
+        for page in (ROOT / "docs").rglob("*.md")
+        for name, value in re.findall(r"`([A-Z][A-Z_]+)` = ([\d.e-]*\d)", page.read_text(encoding="utf-8"))
+    }
+    assert len(quoted) > 20 and not [q for q in sorted(quoted) if known.get(q[1]) != q[2]]
+
+
 def test_command_modules_are_light() -> None:
     for path in [*(PACKAGE / "cli").glob("*.py"), PACKAGE / "laws" / "law_file.py"]:
         roots = {name.split(".")[0] for name in imports(path, top_only=True)}

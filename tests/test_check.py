@@ -254,7 +254,7 @@ def test_bounds_and_free_starts_cost_what_they_must(made: Path) -> None:
 def test_a_long_run_is_thinned_without_another_answer(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     experiment = read_experiment(made, registry=REGISTRY)
     whole = told(experiment).runs[1].errors
-    monkeypatch.setattr(reach, "LONGEST", 900)
+    monkeypatch.setattr(reach, "MOST_SIMULATED", 900)
     thin = told(experiment).runs[1].errors
     for name in whole:  # what a step of the load makes takes a few samples, of which blocks have more or fewer
         assert thin[name] == pytest.approx(whole[name], rel=0.3)

@@ -164,8 +164,8 @@ def test_the_difference_is_where_it_is_said_to_be(diagnosis: Diagnosis, found: D
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_run(diagnosis: Diagnosis, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "DRAWN", 4)
-    monkeypatch.setattr(module, "VARIED", 1)
+    monkeypatch.setattr(module, "CANDIDATE_RUNS", 4)
+    monkeypatch.setattr(module, "VARIATIONS", 1)
     made = [discriminating_run(SHIPPED, diagnosis, seed=seed) for seed in (1, 1, 2)]
     assert made[0] is not None and made[1] is not None and made[2] is not None
     assert made[0].proposal == made[1].proposal != made[2].proposal and made[0].gain == made[1].gain
@@ -174,8 +174,8 @@ def test_the_same_seed_gives_the_same_run(diagnosis: Diagnosis, monkeypatch: pyt
 
 def test_one_class_is_said_to_be_one(diagnosis: Diagnosis, monkeypatch: pytest.MonkeyPatch) -> None:
     """A hypothesis beside its own double, and a third: no run discriminates between these two."""
-    monkeypatch.setattr(module, "DRAWN", 4)
-    monkeypatch.setattr(module, "VARIED", 1)
+    monkeypatch.setattr(module, "CANDIDATE_RUNS", 4)
+    monkeypatch.setattr(module, "VARIATIONS", 1)
     first, second = diagnosis.close
     (effect,) = first.hypothesis.effects
     double = replace(first, hypothesis=Hypothesis((replace(effect, name="double", answers="double"),)))

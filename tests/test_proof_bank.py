@@ -150,7 +150,7 @@ def test_recipes_draw_what_is_asked_for():
 
 
 def test_a_slider_that_cannot_be_followed_is_drawn_again_and_in_the_end_told(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr("srfcli.validation.slider.MOST_STEPS", 3)
+    monkeypatch.setattr("srfcli.validation.slider.STEPS_BETWEEN", 3)
     assert not move(Physics(), SHORT[0]).complete
     with pytest.raises(SrfError, match="none of 8 sliders"):
         make_case(tmp_path / "c", 1)

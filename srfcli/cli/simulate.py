@@ -292,7 +292,7 @@ def _drive_pieces(given: Mapping[str, Any], V: float, length: float | None) -> t
         return pieces
     if given["duration"] is not None:
         length = parse_quantity(given["duration"], "s", name="--for")
-        if not 0 < length <= LONGEST:
+        if not 0 < length <= LONGEST_TIME:
             raise SrfError(f"--for {length:g} s is not a length of time", "Write --for 4.")
     return ((float(f"{TRAVEL / V:.3g}") if length is None else length, V, V),)
 
@@ -337,8 +337,8 @@ def _placed(names: Sequence[str]) -> tuple[str, ...]:
 # Reading of options: pieces of drive and load, sampling rates, start values, the random friction field.
 
 TRAVEL = 40.0  # um of driving where no duration is given
-LONGEST = 1e12  # s
-LENGTH = 10.0  # um, the correlation length where only a size is given
+LONGEST_TIME = 1e12  # s
+ROUGHNESS_LENGTH = 10.0  # um, the correlation length where only a size is given
 
 Piece = tuple[float, float, float]  # duration (s), and the values between which a quantity runs straight
 
@@ -361,8 +361,8 @@ def _parse_piece(part: str, number: int, unit: str, option: str, example: str) -
     if not colon or not duration_text.strip() or not all(ends) or len(ends) > 2:
         raise SrfError(f"{where} is not DURATION:VALUE or DURATION:FROM->TO", f"Write {option} '{example}'.")
     duration = parse_quantity(duration_text, "s", name=f"{option}: the duration of piece {number}")
-    if not 0 < duration <= LONGEST:
-        raise SrfError(f"{where} lasts {duration:g} s", f"Give each piece a duration above 0, up to {LONGEST:g} s.")
+    if not 0 < duration <= LONGEST_TIME:
+        raise SrfError(f"{where} lasts {duration:g} s", f"Give each piece a duration above 0, up to {LONGEST_TIME:g} s.")
     split = [split_quantity(end, name=f"{option}: the value of piece {number}", example=f"5 {unit}") for end in ends]
     written = next((u for _, u in reversed(split) if u), unit)
     values = [convert(v, u or written, unit, name=f"{option}: piece {number}") for v, u in split]
@@ -405,7 +405,7 @@ def read_field(given: Mapping[str, Any]) -> FrictionField | None:
     from srfcli.data.noise import FrictionField
 
     size = parse_quantity(given["roughness"], "1", name="--roughness")
-    length = parse_quantity(given["roughness_length"] or str(LENGTH), "um", name="--roughness-length")
+    length = parse_quantity(given["roughness_length"] or str(ROUGHNESS_LENGTH), "um", name="--roughness-length")
     field = FrictionField(size, length, given["seed"])
     return field if field.amplitude else None
 

@@ -10,7 +10,7 @@ from enum import Enum
 
 # control characters but tab and newline, DEL and the second set, marks that are not seen or turn the line round, lone
 # surrogates (bytes of file names that are no text): what a terminal acts on, or shows as something else than it is
-LONGEST = 2000  # characters of a message
+LONGEST_MESSAGE = 2000  # characters of a message
 _UNSEEN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
     "\ud800-\udfff\U000e0000-\U000e0fff]"
@@ -27,8 +27,8 @@ def printable(text: str, *, line: bool = False) -> str:
 
 
 def shortened(text: str) -> str:
-    """Return the text, without its middle where it is longer than LONGEST: a key of 100 kB is told by its ends."""
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 4 :]}"
+    """Return the text, without its middle where it is longer than LONGEST_MESSAGE: a key of 100 kB is told by its ends."""
+    return text if len(text) <= LONGEST_MESSAGE else f"{text[: LONGEST_MESSAGE // 2]} ... {text[-LONGEST_MESSAGE // 4 :]}"
 
 
 def shown(value: object) -> str:

@@ -218,7 +218,7 @@ def run_cluster(function: Callable[[Task], Result], tasks: Sequence[Task], *, ad
 
 NOTE = "srf-run.json"
 LARGEST_RESULT = 2**30  # bytes of a finished task
-SEAL = 64  # hexadecimal digits at the end of a part
+SEAL_DIGITS = 64  # hexadecimal digits at the end of a part
 _DAMAGED = (  # what reading a file of arrays raises that is not one
     OSError, SrfError, ValueError, EOFError, KeyError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
@@ -268,7 +268,7 @@ class Store:
 
         try:
             whole = read_plain(self._place(index), limit=LARGEST_RESULT)
-            content, found = whole[:-SEAL], whole[-SEAL:].decode("ascii", "replace")
+            content, found = whole[:-SEAL_DIGITS], whole[-SEAL_DIGITS:].decode("ascii", "replace")
             if not is_sealed(self._name(index), content, found):
                 return None
             with np.load(io.BytesIO(content), allow_pickle=False) as data:

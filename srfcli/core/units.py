@@ -54,7 +54,7 @@ _SPELLED = {  # in small letters, as headings of recordings have them
 }  # fmt: skip
 SQUARE_MILLIMETRE = 1e6  # um^2: a stress is taken as the force on this area
 
-LONGEST = 200  # characters of a number with its unit
+LONGEST_QUANTITY = 200  # characters of a number with its unit
 LONGEST_HEADING = 500  # characters of a heading that are looked through for its unit
 _HEADING = re.compile(r"\s*(.*?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
@@ -106,7 +106,7 @@ def parse_quantity(text: str, unit: str, *, name: str) -> float:
 
 def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float, str]:
     """Return the number and the unit that `text` states; the unit is "" for a bare number."""
-    if len(text) > LONGEST:
+    if len(text) > LONGEST_QUANTITY:
         raise SrfError(f"{name}: {len(text)} characters are no number", f"Write it as in {name}='{example}'.")
     match = _NUMBER.fullmatch(text)
     if not match:
@@ -193,7 +193,7 @@ def tidy(value: float) -> float:
 
 def find_unit(text: str, *, where: str = "") -> Unit:
     """Return the unit that `text` names; raises SrfError, beginning with `where`, if there is none."""
-    if len(text) > LONGEST:
+    if len(text) > LONGEST_QUANTITY:
         raise SrfError(f"{where}: {len(text)} characters are no unit".lstrip(": "), "Write a unit as in N/um, um/s.")
     spelled = text.strip().replace("**", "^").replace("μ", "u").replace("µ", "u")
     spelled = _SPELLED.get(spelled.lower(), spelled)

@@ -22,7 +22,7 @@ CHANGE = 1.25  # of the sampling interval
 GAP_INTERVALS = 2.5  # sampling intervals
 _BRIDGED = "drive and load are bridged, nothing is compared in it"
 SHORTEST_RATE = 8  # samples that make a rate
-TOLD_APART = 60  # samples at a rate from which its noise is estimated apart from that at others
+RATE_SAMPLES = 60  # samples at a rate from which its noise is estimated apart from that at others
 MOST_NOTICES = 8  # of one kind before they are told together
 
 
@@ -55,7 +55,7 @@ class Sampling:
             else:
                 groups.append([rate])
         size = [sum(r.last - r.first for r in group) for group in groups]
-        return [g for g, n in zip(groups, size, strict=True) if n >= min(TOLD_APART, max(size))]
+        return [g for g, n in zip(groups, size, strict=True) if n >= min(RATE_SAMPLES, max(size))]
 
     @cached_property
     def spacings(self) -> tuple[float, ...]:

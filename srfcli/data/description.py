@@ -32,7 +32,7 @@ from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Declared
 from srfcli.motion.imposed import RISE
 
 FORMAT = "srf-experiment/1"
-FILE_NAME = "experiment.toml"
+DESCRIPTION = "experiment.toml"
 ROLES = {  # what a column may be, and the unit of a number in it where neither heading nor [columns] say
     "time": "s",
     "load_point_velocity": "um/s",
@@ -168,13 +168,13 @@ def find_file(path: Path) -> Path:
     if not path.exists():
         recover(path)  # a process that replaced it may have been killed
     if not path.exists():
-        raise SrfError(f"no experiment {path}", f"Give a folder with an {FILE_NAME}, or the TOML file.")
+        raise SrfError(f"no experiment {path}", f"Give a folder with an {DESCRIPTION}, or the TOML file.")
     if path.is_dir():
-        file = path / FILE_NAME
+        file = path / DESCRIPTION
         if not file.is_file():
             others = sorted(p.name for p in path.glob("*.toml"))
             hint = f"Name the file: {path / others[0]}" if others else "srf new DATA.csv writes one for recorded data."
-            raise SrfError(f"{path}: holds no {FILE_NAME}", hint)
+            raise SrfError(f"{path}: holds no {DESCRIPTION}", hint)
         return file
     if not path.is_file():
         check_plain(path)  # says what it is instead

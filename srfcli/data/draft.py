@@ -33,7 +33,7 @@ from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.groups import levels
 from srfcli.data.imposed import StartsAtRest, Stroke, find_modulation, strokes
 from srfcli.data.scales import scales_of
-from srfcli.data.values import Run, told_of_runs
+from srfcli.data.values import BOUND_FACTOR, Run, told_of_runs
 from srfcli.laws.registry import Registry
 
 NAMED = {  # role -> what headings call it, in small letters without their unit; the first that a file has is taken
@@ -88,7 +88,7 @@ UNIT_SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
 STRESSES = {"normal_load": "normal_stress", "force": "shear_stress"}
 FORCE_OF_STRESS = {stress: force for force, stress in STRESSES.items()}
 OBSERVED = ("elongation", "force", "shear_stress", "friction")
-TOLD = ("friction", "drive-smoothed")  # kinds of notices that mean that the file was misread, or is not what it seems
+MISREAD = ("friction", "drive-smoothed")  # kinds of notices that mean that the file was misread, or is not what it seems
 NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
 HOLD_SPEED = 0.05  # of the slowest sliding, below which is a hold
 UNLIKE_START = 0.02  # of the friction before the first step: first readings that are farther from it are not of steady sliding
@@ -109,7 +109,6 @@ RIG = {
     "area": "of the sheared contact: force over it is the stress",
 }
 NO_MASS = '# mass = "2.37 kg"   # of the slider; without it the slider is quasi-static'
-BOUND_FACTOR = 5.0  # from another law's defaults to its bounds
 
 
 @dataclass(frozen=True)
@@ -366,7 +365,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     sketch, runs = _read(sketch, registry)
     if sketch.negative:
         remarks.append("compression is negative in the file: the load counts with the other sign")
-    remarks += told_of_runs(runs, TOLD)
+    remarks += told_of_runs(runs, MISREAD)
     modulations = _modulations(runs)
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
     remarks.append(f"kind of experiment: {kind}, {why}")

@@ -17,7 +17,7 @@ from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, 
 from srfcli.data.clock import Mask, Place, Sampling, find_sampling, kept_samples, sampling_notices
 from srfcli.data.columns import MOST_BYTES, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, Description, Node, RunDescription, ThresholdsDescription, read_description
-from srfcli.data.gauge import FEWEST_SAMPLES, GaugeNoise, find_noise
+from srfcli.data.gauge import COLOUR_SAMPLES, GaugeNoise, find_noise
 from srfcli.data.groups import BY, TRENDS, grouped
 from srfcli.data.imposed import ACCIDENTS, LOADS, FoundModulation, check_start, drive_of, find_modulation, load_of
 from srfcli.data.noise import WIDEST_SPIKE, observable_jumps, quantisation, saturation, spikes, white_level
@@ -519,7 +519,7 @@ def check_run(run: Run) -> RunCheck:
     pieces, noises = [*zip(np.split(x, cut), sampling.at[[0, *cut]], absent[[0, *cut]], strict=True)], []
     for k, dt in enumerate(sampling.spacings):
         parts = [piece for piece, at, missing in pieces if at == k and not missing]
-        if max(map(len, parts), default=0) < FEWEST_SAMPLES:  # a channel that is slower than the file: bridged after all
+        if max(map(len, parts), default=0) < COLOUR_SAMPLES:  # a channel that is slower than the file: bridged after all
             parts = [x[a : b + 1] for a, b in runs_of(sampling.at == k)]
         noises.append(find_noise(parts, dt, quantum=run.quantum, cycles=modulation.frequency * dt if modulation else None))
     noise = noises[int(np.argmax(np.bincount(sampling.at)))]

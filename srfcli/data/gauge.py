@@ -32,7 +32,7 @@ STRETCHES = (64, 128, 256)  # samples over which a parabola is the trend: the lo
 SLOW = 3  # lowest frequencies of stretches, which those half as long do not resolve
 SPECTRUM_RISE = 1.5  # power at these frequencies over that predicted from shorter stretches, at most; more is signal
 SLOWEST = 2.0  # periods of an oscillation in a stretch, at least
-FEWEST_SAMPLES = 32  # samples from which coloured noise is estimated
+COLOUR_SAMPLES = 32  # samples from which coloured noise is estimated
 ENOUGH_STRETCHES = 4  # stretches; if there are more, some may be rejected
 REJECTED_SHARE = 1e-3  # share of stretches of pure noise that are rejected
 CALM_ROUNDS = 4  # in which the calm stretches are chosen anew
@@ -178,7 +178,7 @@ def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0,
     lengths = [n for n in STRETCHES if n <= longest] or [longest]
     # the rounding of numbers, where there is no noise
     least = max(1e-9 * max(float(np.ptp(piece)) for piece in pieces), LEAST_DEVIATION)
-    if lengths[0] < FEWEST_SAMPLES:
+    if lengths[0] < COLOUR_SAMPLES:
         return GaugeNoise(max(white_level(max(pieces, key=len)), least), quantum)
     found: GaugeNoise | None = None
     for n in lengths:

@@ -18,7 +18,7 @@ from srfcli.core.units import is_stress
 from srfcli.data.clock import Place, kept_samples
 from srfcli.data.columns import MOST_BYTES, Columns, Finder, open_source
 from srfcli.data.description import RunDescription
-from srfcli.data.noise import quantisation, saturation, spikes, white_level
+from srfcli.data.noise import NOISE_SAMPLES, quantisation, saturation, spikes, white_level
 from srfcli.data.values import OBSERVABLES, Declared
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation, SampledLoad
@@ -197,7 +197,7 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
     moved = X[known]
     for at, size in line.jumps if correct else ():
         moved[at + 1 :] -= size
-    if line.misfit > UNEXPLAINED * line.noise or (line.misfit > 2 * line.noise and _bends(t[known], moved, line)):
+    if line.misfit > OFF_THE_LINE * line.noise or (line.misfit > 2 * line.noise and _bends(t[known], moved, line)):
         drive, kind = _smooth_drive(t[known], moved), "drive-smoothed"
         what = (
             f"a smooth curve, {drive(t).min():.5g} to {drive(t).max():.5g} um/s, goes through the displacements, from which "
@@ -326,17 +326,16 @@ def _turns(x: Array, least: float) -> list[int]:
 
 FEWEST_OF_PIECE = 5  # samples of a piece, or as many usual sampling intervals where samples are rare
 CORNER_ROUNDS = 40  # of the search for the places of the corners
-STRETCH = 128  # samples over which noise has its colour
-BURST = STRETCH  # samples of a burst of noise, at most
+NOISE_STRETCH = 128  # samples over which noise has its colour
+BURST = NOISE_STRETCH  # samples of a burst of noise, at most
 CORNER = 4.0  # factor by which a corner lowers the squares of a stretch's residual, and the colour of noise does not
 MOST_CORNERS = 4  # of a stretch
 AROUND = 15  # neighbouring stretches from which the noise of one is estimated
-NOISE_SAMPLES = 101  # samples that share a level of white noise
 CLEAR = 8.0  # standard deviations about the lines beside it that a level jump exceeds
 SAMPLES_BESIDE = 200  # samples on each side by which a jump is told from a corner
 EVEN = 1e-5  # of the largest noise, at least: with smaller ones the rest would be lost in rounding
 LEAST_NOISE = 1e-100  # um or um/s: a noise whose square is still a number
-UNEXPLAINED = 30.0  # times its noise that a displacement differs from the line, from where a smooth curve takes its place
+OFF_THE_LINE = 30.0  # times its noise that a displacement differs from the line, from where a smooth curve takes its place
 MOST_RAMPS = 64  # of velocity, to one piece of that curve
 SMOOTHEST = 1e-6  # of the displacement's range, by which they may differ from the curve
 WOBBLE = 0.02  # relative change of slope below which there is no corner
@@ -419,7 +418,7 @@ def coloured_noise(t: Array, x: Array, sigma: Array, step: float) -> Array:
     """
     from scipy.ndimage import percentile_filter
 
-    length = min(STRETCH, x.size)
+    length = min(NOISE_STRETCH, x.size)
     starts = np.arange(0, x.size - length + 1, length)
     found = np.empty(starts.size)
     for k, at in enumerate(starts.tolist()):
@@ -694,7 +693,7 @@ def _step(t: Array, x: Array, sigma: Array, knots: Array, heights: Array, dampin
 LOADS = ("normal_load", "normal_stress")
 NEGLIGIBLE = 1e-5  # of the load's range: noise below it is interpolated and not smoothed
 SELDOM = 100  # samples to each that differs from the one before, from which a load was set, and what is between has no noise
-BLOCKS = 16  # whose means are compared to see whether a load is constant
+LOAD_BLOCKS = 16  # whose means are compared to see whether a load is constant
 ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
 NO_CONTACT = 1e-15  # N: no contact
 SAMPLES_A_PERIOD = 8  # of a modulation, from which a column shows it to 1e-3 of its amplitude
@@ -797,7 +796,7 @@ def is_constant(W: Array, noise: float) -> bool:
     """Return whether the loads W (n,) spread about one mean as white noise of this size does, in all and in blocks."""
     if W.std() > 1.5 * noise:
         return False
-    count = min(BLOCKS, W.size // 8)
+    count = min(LOAD_BLOCKS, W.size // 8)
     if count < 2:
         return True
     blocks = np.array_split(W, count)

@@ -62,7 +62,7 @@ SIDE = 5  # samples before and after that tell the level
 SPIKE_FACTOR = 8.0  # robust standard deviations
 SUDDEN = 4.0  # times as far off as noise is: from there on one step that outruns the drive makes a spike
 CREST = 0.5  # share of a spike's size by which it is off a cubic through its neighbours, at least
-ALONE = 4.0  # steps by which a spike among the first or last samples is off its neighbours: of those there, the third largest
+END_SPIKE = 4.0  # steps by which a spike among the first or last samples is off its neighbours: of those there, the third largest
 NOISE_SAMPLES = 101  # samples that share a level of noise
 FEW = 0.02  # share of samples off their running median, below which the channel counts as constant and without noise
 SATURATED = 10  # samples in a row at the extreme value
@@ -127,7 +127,7 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
     x = np.concatenate([_before(x[: 2 * SIDE]), x, _before(x[: -2 * SIDE - 1 : -1])[::-1]])
     found, m = np.zeros(x.size, bool), median_filter(x, size=SIDE, mode="nearest")
     steps = [np.sort(np.abs(np.diff(part)))[-3] for part in (x[SIDE : 3 * SIDE], x[-3 * SIDE : -SIDE])]
-    ends = [ALONE * step for step in steps]  # the end of a wave or of a decay is no spike
+    ends = [END_SPIKE * step for step in steps]  # the end of a wave or of a decay is no spike
     for width in range(1, WIDEST_SPIKE + 1):
         first = np.arange(SIDE, x.size - SIDE - width + 1)
         before, after = m[first - 3], m[first + width + 2]
@@ -324,7 +324,7 @@ def quantised(values: Array, quantum: float) -> Array:
 
 KNOTS = 8  # to a correlation length: halfway between two of them the variance falls short by 4e-4
 WIDEST_KNOTS, FINEST_KNOTS = 0.8, 0.01  # um between knots: as wide as a fit's; contacts are 0.1 um or more
-MOST_KNOTS = 2_000_000  # knots between position 0 and the far end of a record
+MOST_FIELD_KNOTS = 2_000_000  # knots between position 0 and the far end of a record
 ECHO = 32  # knots over which a value acts on a spline's coefficients: sqrt(3) - 2 to this power is below the last bit
 
 
@@ -360,7 +360,7 @@ class FrictionField:
 
         Raises SrfError where that takes more knots than there is room for.
         """
-        h, most = self.spacing, MOST_KNOTS - 2 * ECHO
+        h, most = self.spacing, MOST_FIELD_KNOTS - 2 * ECHO
         if not max(abs(low), abs(high)) < most * h:
             raise SrfError(
                 f"a track to position {max(abs(low), abs(high)):g} um, in steps of {h:g} um, has more than {most} knots",

@@ -20,6 +20,7 @@ from srfcli.motion.imposed import Drive, Load
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
 OTHER_OBSERVABLES = {"slip": "um", "contact_area": "1"}  # what may be observed besides one of these
 BETWEEN_SAMPLES = ("drive-steps", "load-steps")  # kinds of notices of what was imposed between samples, unknown when
+BOUND_FACTOR = 5.0  # from a value, or a law's default, to the bounds of a fit
 AREA_GROWTH = 0.05  # of a contact area by e-fold of its age: 0.02 to 0.1 for rock, glass and polymers
 
 

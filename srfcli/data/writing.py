@@ -13,12 +13,11 @@ import numpy as np
 from srfcli.core.errors import SrfError
 from srfcli.core.files import SIDECAR, check_folder_place, clear, parse_toml, read_text, toml_lines, unused_name, whole_folder
 from srfcli.core.units import find_unit
-from srfcli.data.description import LARGEST_DESCRIPTION, MODULATION
+from srfcli.data.description import DESCRIPTION, LARGEST_DESCRIPTION, MODULATION
 from srfcli.data.thresholds import thresholds_csv
 from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, Run
 from srfcli.motion.imposed import Drive
 
-DESCRIPTION = "experiment.toml"
 KILOGRAM = 1e-6  # N s^2/um
 
 

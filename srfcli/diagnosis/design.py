@@ -39,7 +39,7 @@ from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 TOLD_APART = 12.0  # of log likelihood: hypotheses so far apart are told apart
 WORTH_MAKING = 3.0  # below which a run is not worth making
 MOST_HYPOTHESES = 3  # hypotheses between which a run is to discriminate
-DRAWN, VARIED = 60, 16  # runs that are tried, and variations of the best of them
+CANDIDATE_RUNS, VARIATIONS = 60, 16  # runs that are tried, and variations of the best of them
 LOOKED = 36  # of these, how many with derivatives, at most
 CONFIRMED = 3  # of the best, how many with the motion itself
 NEWTON_ROUNDS = 10  # of Gauss and Newton
@@ -206,11 +206,11 @@ class Design:
 
     def best(self) -> DiscriminatingRun | None:
         """Return the best run, None where no model can be followed through any."""
-        looked = self.look(draw(self.apparatus, DRAWN, self.rng), LOOKED)
+        looked = self.look(draw(self.apparatus, CANDIDATE_RUNS, self.rng), LOOKED)
         if not looked:
             return None
-        near = vary(looked[0].proposal, self.apparatus, VARIED, self.rng)
-        looked = sorted([*looked, *self.look(near, VARIED, above=looked[0].gain)], key=lambda t: -t.gain)
+        near = vary(looked[0].proposal, self.apparatus, VARIATIONS, self.rng)
+        looked = sorted([*looked, *self.look(near, VARIATIONS, above=looked[0].gain)], key=lambda t: -t.gain)
         best: DiscriminatingRun | None = None
         for trial in looked[:CONFIRMED]:
             found = self.judge(trial)

@@ -26,11 +26,12 @@ from srfcli.codegen.model import Array
 from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base
 from srfcli.diagnosis.hypotheses import own_parameters
+from srfcli.diagnosis.residual_scan import BINS
 from srfcli.diagnosis.search import BUDGET, CLOSE, Fitted, ModelSearch
 from srfcli.diagnosis.verdict import Diagnosis, Held, at_bounds, held_out, refusal
 from srfcli.inference.fit import root
 from srfcli.inference.recordings import slip_along
-from srfcli.laws.effect_file import formula_text
+from srfcli.laws.effect_file import SCANNED_VALUES, formula_text
 from srfcli.laws.expression import symbol
 from srfcli.laws.law_file import read_header
 from srfcli.laws.registry import Entry, Registry
@@ -41,7 +42,6 @@ from srfcli.symbolic.system import apart
 
 NORMAL = 1.959963984540054  # standard deviations of a 95 % band
 DIFFERENCE_STEP = 0.2  # standard errors of the differences that tell what the parameters' errors do to it
-BINS = 12  # in which the force is averaged along a quantity of state
 COORDINATES = ("v", "phi", "W", "dlnWdt", "slip", "t")
 
 
@@ -208,7 +208,6 @@ def explain_unknown(diagnosis: Diagnosis, form: ClosedForm | None, *, searched: 
 # A closed form that was found for what is missing: its text, its effect file, and how well it does.
 
 FORM_NAME = "closed-form"
-SCANNED_VALUES = 8  # values at which a later search tries the parameters that are seen only where the form's size is not neutral
 
 
 @dataclass(frozen=True)

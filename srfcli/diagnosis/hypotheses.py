@@ -13,7 +13,7 @@ from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.settings import Parameter
 from srfcli.core.units import to_base
 from srfcli.data.scales import at_scale, scales_of
-from srfcli.data.values import Experiment, FitParameter
+from srfcli.data.values import BOUND_FACTOR, Experiment, FitParameter
 from srfcli.inference.fit import Problem, fit_problem
 from srfcli.inference.prediction import of_run
 from srfcli.laws.expression import symbol
@@ -21,7 +21,6 @@ from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.symbolic.system import without_part
 
-LAW_BOUNDS = 5.0  # from the defaults of another ageing law to the bounds of what it has of its own
 ABSENT = 1e-3  # of the least size of an effect: what it does in a run where it does not act is far below any noise
 UNMODULATED = {symbol(name): 0 for name in ("modulated", "eps", "envelope")}
 
@@ -215,7 +214,7 @@ def law_parameters(registry: Registry, ageing: str, experiment: Experiment) -> l
     listed, found = {q.name for q in experiment.parameters}, []
     for p in law.parameters:
         if p.name not in listed and p.default > 0:
-            low, high = max(p.lower, p.default / LAW_BOUNDS), min(p.upper, p.default * LAW_BOUNDS)
+            low, high = max(p.lower, p.default / BOUND_FACTOR), min(p.upper, p.default * BOUND_FACTOR)
             value, low, high = (to_base(x, p.unit) for x in (p.default, low, high))
             found.append(FitParameter(p.name, value, low, high, False, p.unit))
     return found

@@ -284,7 +284,7 @@ def _cycle(run: Run) -> Array | None:
 # Local statistics of a residual, all under one null: windows, bins, lines and smooth functions that may stand out.
 
 WAVES, SHORTEST, HALVINGS = 4, 24, 5  # cosines over a window, samples of the shortest, how often a run is halved
-BINS = 12
+BINS = 12  # of a phase or a quantity, in which residuals or a missing force are averaged
 NUMBERS_AT_ONCE = 4_000_000  # numbers of simulated residuals held at a time
 OFF = 1.08  # factor by which a run's own noise level may differ from the assumed variance and count as noise
 NO_LEVERAGE = 1e-6  # standard deviations by which a parameter moves all innovations together: it has nothing to do with them

@@ -32,7 +32,7 @@ MODIFIER = "linker-dieterich"
 SIZES = {"alpha": 0.2, "lambda": 0.1, "n": 0.1}  # that one would want to see: of rock's alpha, of lambda's own value, of n
 OTHER_MOTION = 3.0  # rms of simulation minus recording over the recording's own spread, from which it is another motion
 STIFFER = 1.5  # from half to twice the stated stiffness
-LONGEST = 20_000  # samples of a run that are simulated; of more, evenly chosen blocks stand for the others
+MOST_SIMULATED = 20_000  # samples of a run that are simulated; of more, evenly chosen blocks stand for the others
 NOISE_BLOCK = 16  # samples of one: the first half tells what the noise is like there, the second half counts
 UNDETERMINED = 100.0  # an error beyond this tells nothing: alpha and n are of order 1, lambda counts relative to itself
 
@@ -213,9 +213,9 @@ def _simulated(question: _Question, check: RunCheck) -> _Told:
 
 def _chosen(size: int) -> tuple[NDArray[np.int64], float]:
     """Return which samples of a run are simulated, and how many each that counts stands for: all, or blocks of a long one."""
-    if size <= LONGEST:
+    if size <= MOST_SIMULATED:
         return np.arange(size), 1.0
-    first = np.linspace(0, size - NOISE_BLOCK, LONGEST // NOISE_BLOCK).astype(int)
+    first = np.linspace(0, size - NOISE_BLOCK, MOST_SIMULATED // NOISE_BLOCK).astype(int)
     return (first[:, None] + np.arange(NOISE_BLOCK)).ravel(), size / (first.size * NOISE_BLOCK / 2)
 
 

@@ -73,10 +73,10 @@ EARLY_DRAWS = 250  # draws for each parameter after which the burn-in makes its 
 FEWEST_STEPS = 50  # between two of these, and of those kept: of fewer nobody could say what they are worth
 LEFT_OUT = 5.0  # correlation times that are left out at the beginning
 BURNT_IN = 1.03  # R-hat at which the burn-in may end
-LONGEST = 1000  # steps of burn-in
+LONGEST_BURN_IN = 1000  # steps of burn-in
 INDEPENDENT = 0.85  # share of proposals that do not depend on where a chain is; the others stretch the ensemble
 WIDER = 1.2  # than the burn-in's draws: chains get stuck where proposals are rarer than the posterior
-MISSED = 2.0  # of log posterior, for a standard error that ends beyond a bound
+OPEN_END = 2.0  # of log posterior, for a standard error that ends beyond a bound
 HEAVY = 10.0  # degrees of freedom of those proposals, so that no tail of the posterior is left out
 ENOUGH_EACH = 8  # draws of the burn-in for each coefficient of the ridge's bend
 
@@ -211,12 +211,12 @@ def draw(
     sampler._random = np.random.RandomState(seed)
     steps, burnt, interrupted = max(-(-count // chains), FEWEST_STEPS), 0, False
     try:
-        for number, _ in enumerate(sampler.sample(start, iterations=LONGEST + steps), 1):
+        for number, _ in enumerate(sampler.sample(start, iterations=LONGEST_BURN_IN + steps), 1):
             if not burnt and number % every == 0:
                 later = sampler.get_chain(discard=number // 3)
                 ridge.learn(later.reshape(-1, k))
                 mixed = number >= LEFT_OUT * _slowness(later) and r_hat(later).max() <= BURNT_IN
-                burnt = number if mixed or number >= LONGEST else 0
+                burnt = number if mixed or number >= LONGEST_BURN_IN else 0
             progress(f"posterior: step {number}", number / (max(burnt, every) + steps))
             if burnt and number == burnt + steps:
                 break
@@ -280,7 +280,7 @@ def _straight(log_posterior: Callable[[Array], float], best: Array, covariance: 
                 theta = best + side * covariance[:, k] / error
                 theta[k] = best[k] * np.exp(side * error / best[k]) if curved else theta[k]
                 ends.append(log_posterior(theta) - base + 0.5)
-            off[curved] = sum(abs(e) if np.isfinite(e) else MISSED for e in ends)
+            off[curved] = sum(abs(e) if np.isfinite(e) else OPEN_END for e in ends)
         logarithmic[k] = off[True] < off[False]
     return _Scale(logarithmic)
 

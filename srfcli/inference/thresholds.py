@@ -329,7 +329,7 @@ POWELL_SETTLED = 1e-4  # the same for a round of Powell's method through all dir
 PERFECT = 3.0  # times the accuracy of the critical loads: residuals all below it are as good as none
 DETOURS = 3  # times that a least squares goes around a jump of the cost
 CLIFF, JUMP = 1e-3, 0.02  # a load that changes by so much, in ln W0, over so little in a coordinate has jumped
-OUTSIDE = 0.05  # a coordinate this far beyond its bound doubles Powell's cost
+BEYOND_BOUND = 0.05  # a coordinate this far beyond its bound doubles Powell's cost
 
 Report = Callable[["Trace"], None]
 
@@ -690,7 +690,7 @@ def _powell(work: _Work, y: Array) -> Status:
     def cost(steps: Array) -> float:
         wanted = FIRST_STEP * steps
         inside = np.clip(wanted, low, high)
-        outside = float(np.abs(wanted - inside).sum()) / OUTSIDE
+        outside = float(np.abs(wanted - inside).sum()) / BEYOND_BOUND
         value = work.at(inside).cost
         return value * (1 + outside) + outside
 

@@ -217,7 +217,7 @@ PER_DECADE = 40  # loads looked at first in each further decade
 # below and above: on a coarser mesh stiff multipliers resonate with the intervals at high loads
 WINDOW_INTERVALS = {-1: 32, 1: 64}
 OVERLAP = 3  # samples that neighbouring pieces share: a crossing at their seam is in one of them
-DECADES = 4  # decades followed beyond either end
+MOST_DECADES = 4  # decades followed beyond either end
 UNSETTLED_SHARE = 0.02  # of the growth rate: what a settled one may differ from its quadratic
 NO_LOAD = 1e-6  # of a load: as good as none
 WINDOW_MARGIN = 2.0  # of a window beyond the outermost crossing
@@ -283,7 +283,7 @@ def _follow(
 ) -> tuple[tuple[LineScan, ...], bool]:
     scans: list[LineScan] = []
     settled = _settled(model, last, direction)
-    while not settled and len(scans) < DECADES and not (scans and 2 * last.lost.size > last.values.size):
+    while not settled and len(scans) < MOST_DECADES and not (scans and 2 * last.lost.size > last.values.size):
         edge = last.values[OVERLAP - 1] if direction < 0 else last.values[-OVERLAP]
         loads = (edge / DECADE, edge) if direction < 0 else (edge, edge * DECADE)
         last = _piece(model, base, loads, direction, resolution)

@@ -37,7 +37,7 @@ NEWTON = 1e-10  # last step of Newton's method
 ROUNDED = 1e-7
 CLIMBED_ON = 64  # intervals of the first mesh that is laid where the state needs it
 EVEN_SHARE = 0.2  # share of the intervals that are spread evenly
-SMALLEST_CLIMB, MOST_CLIMBS = 1e-4, 200  # shares of eps
+FINEST_CLIMB, MOST_CLIMBS = 1e-4, 200  # shares of eps
 WHILE_CLIMBING = 1e-4  # estimated error from which on the mesh is made finer on the way
 RELIED_ON = 31.0  # an interval halved gains 2^8 in theory, 2^5 is relied on
 
@@ -171,16 +171,16 @@ def _laid(model: GeneratedModel, orbit: Discretisation, intervals: int) -> Array
 def climbed(model: GeneratedModel, p: Array, finest: int) -> tuple[OrbitBatch, float]:
     """Return the orbit at `p` (n_parameters, 1) by raising eps from 0 on a mesh that is laid anew at each step.
 
-    The number says which share of eps was reached: below 1 a step of SMALLEST_CLIMB of eps failed, as where the branch of states
+    The number says which share of eps was reached: below 1 a step of FINEST_CLIMB of eps failed, as where the branch of states
     turns back or velocities leave the range of numbers, and the orbit, of the last eps that went, is marked as not converged.
     """
     eps, edges, calm = p[model.index("eps")], uniform_mesh(CLIMBED_ON), model.with_values(p, eps=0.0)
     batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=ROUNDED)
     reached, step, tries = 0.0, FIRST_CLIMB, 0
     slope = batch.orbit.unchanged()
-    while batch.converged[0] and reached < 1 and step > SMALLEST_CLIMB and tries < MOST_CLIMBS:
+    while batch.converged[0] and reached < 1 and step > FINEST_CLIMB and tries < MOST_CLIMBS:
         tries += 1
-        target = 1.0 if reached + step > 1 - SMALLEST_CLIMB else reached + step
+        target = 1.0 if reached + step > 1 - FINEST_CLIMB else reached + step
         q, before, ahead = model.with_values(p, eps=target * eps), batch.orbit, target - reached
         found = solve_orbits(model, q, before + ahead * slope, tol=ROUNDED, max_iterations=CLIMBING)
         if not found.converged[0]:

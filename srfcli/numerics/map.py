@@ -216,7 +216,7 @@ def _tile_seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
 # One tile of a stability map: orbits on a coarse grid, the others from their neighbours, cells refined where it matters.
 
 GRAIN = 4  # meshes are multiples of this many intervals
-NEIGHBOUR_STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # to the points beside a point, in columns and rows
+NEIGHBOURS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # to the points beside a point, in columns and rows
 SETTLING = 1000  # periods of a simulation: just beyond a fold the motion lingers
 SETTLINGS = 32  # simulations at most in a tile,
 IN_VAIN = 3  # and in a row without a periodic state
@@ -354,7 +354,7 @@ class _Block:
         found = np.zeros_like(converged)
         beside = [
             (c, r, c - dc, r - dr)
-            for dc, dr in NEIGHBOUR_STEPS
+            for dc, dr in NEIGHBOURS
             for c, r in np.argwhere(_moved(converged, dc, dr) & ~converged).tolist()
         ]
         if beside:
@@ -370,7 +370,7 @@ class _Block:
         converged = self.orbits.converged
         while fresh.any() and not converged.all():
             added = np.zeros_like(fresh)
-            for dc, dr in NEIGHBOUR_STEPS:
+            for dc, dr in NEIGHBOURS:
                 to_c, to_r = np.nonzero(_moved(fresh, dc, dr) & ~converged)
                 if not to_c.size:
                     continue

@@ -14,9 +14,9 @@ import numpy as np
 from srfcli.codegen.model import COMPLEX_STEP, Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.collocation import mesh_error, stage_parameters, wanted_mesh
+from srfcli.numerics.critical import INTERVALS
 from srfcli.numerics.orbit import OrbitBatch, growth, interpolate, robust_orbits, uniform_mesh
 
-INTERVALS = 16
 NO_ORBIT = 1e9  # the error of an orbit that was not found: the mesh grows as fast as it may
 
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
+from srfcli.codegen.model import COMPLEX_STEP, Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind, left_vector, pick_multiplier, upper_half, weights_backwards
 from srfcli.numerics.collocation import (
@@ -241,7 +241,6 @@ class _Chord:
 # an unstable one before it if d > 0. Second and third derivatives of the map are variational equations of higher order along
 # the orbit, solved on its own mesh; those of the field are generated second derivatives, and their complex step.
 
-COMPLEX_STEP = 1e-25  # of a complex step
 REAL_MULTIPLIER = 1e-6  # a multiplier nearer to the real axis has no normal form of this kind
 CRITICALITY = "criticality"
 POINTS_TOGETHER = 16  # points whose derivatives fit the cache

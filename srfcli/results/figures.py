@@ -56,8 +56,8 @@ def gains(x: plots.Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool,
 
 RECORD_COLUMNS = 1500  # columns in which a long record is drawn by its extremes
 # consecutive samples from which a band is drawn; most single ones that are marked with crosses
-STRETCH, CROSSES = 20, 100
-DECADES = 30.0  # ratio of velocities from which their axis is logarithmic
+BAND_SAMPLES, CROSSES = 20, 100
+LOGARITHMIC_FROM = 30.0  # ratio of velocities from which their axis is logarithmic
 UNUSED = "#D55E00"
 
 
@@ -149,13 +149,13 @@ def imposed_scale(axis: Axes, values: Any, *, wide: bool) -> None:
         middle = float(values[0])
         axis.set_ylim(middle - 0.5 * abs(middle) - 1e-9, middle + 0.5 * abs(middle) + 1e-9)
         axis.locator_params(axis="y", nbins=3)
-    elif wide and values.min() > 0 and size > DECADES * values.min():
+    elif wide and values.min() > 0 and size > LOGARITHMIC_FROM * values.min():
         axis.set_yscale("log")
         if np.floor(np.log10(size)) - np.ceil(np.log10(values.min())) < 2:  # fewer than three decades to label
             ends = [float(values.min()), size]
             axis.set_yticks(ends, [f"{x:.3g}" for x in ends])
         axis.set_yticks([], minor=True)
-    elif wide and size > DECADES * float(np.median(np.abs(values))) > 0:  # with a stop or a move back among them
+    elif wide and size > LOGARITHMIC_FROM * float(np.median(np.abs(values))) > 0:  # with a stop or a move back among them
         threshold = float(np.median(np.abs(values)))
         axis.set_yscale("symlog", linthresh=threshold)
         axis.set_ylabel("V symlog\n[µm/s]")
@@ -174,7 +174,7 @@ def _mark_unused(axis: Axes, t: Any, x: Any, bad: Any) -> str:
         return ""
     total = int(bad.sum())
     for first, last in runs_of(bad):
-        if last - first + 1 >= STRETCH:
+        if last - first + 1 >= BAND_SAMPLES:
             axis.axvspan(t[first], t[last], color=UNUSED, alpha=0.25, linewidth=0)
             bad[first : last + 1] = False
     single = np.flatnonzero(bad)

@@ -19,8 +19,7 @@ from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import lag_one
 from srfcli.inference.posterior import not_quadratic
 from srfcli.inference.profile import FARTHER
-from srfcli.inference.state_space import WIDE as FIELDS_AT_FIRST
-from srfcli.inference.state_space import typical_friction
+from srfcli.inference.state_space import WIDE, typical_friction
 from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
 from srfcli.results.figures import draw_loads, stacked
@@ -105,7 +104,7 @@ ADVICE = {
     Status.INTERRUPTED: "the likeliest parameters so far are above.",
 }
 LINEAR = "intervals: 1.96 standard errors; --profile refits, 95 %"
-CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
+NEAR_BOUND, UNDETERMINED_WIDTH, TIED = 1e-3, 1.0, 0.99
 TESTS_TOLD = 3  # tests that a fit fails, of which its notes tell, the worst first
 
 
@@ -347,7 +346,7 @@ class FitResult(Result):
         if found.friction_field is not None:
             notes.append(str(found.friction_field))
         notes += self.against
-        if self._field_share > FIELDS_AT_FIRST[0][0]:
+        if self._field_share > WIDE[0][0]:
             notes.append(
                 "under so wide a field a recording is followed whatever the parameters are, and the maximum may be a wrong one: "
                 "try --starts 5, or start values nearer to what is known"
@@ -513,16 +512,16 @@ def flag(fit: Fit, k: int) -> str:
     """Return what stands against an estimate: at a bound, sought no further, not determined, or tied to another parameter."""
     name = fit.names[k]
     width = fit.upper[k] - fit.lower[k]
-    if min(fit.values[name] - fit.lower[k], fit.upper[k] - fit.values[name]) < CLOSE * width:
-        return "at its lower bound" if fit.values[name] - fit.lower[k] < CLOSE * width else "at its upper bound"
+    if min(fit.values[name] - fit.lower[k], fit.upper[k] - fit.values[name]) < NEAR_BOUND * width:
+        return "at its lower bound" if fit.values[name] - fit.lower[k] < NEAR_BOUND * width else "at its upper bound"
     if fit.status is Status.INTERRUPTED:
         return "not at the maximum: the fit was interrupted"
-    if fit.stderr[name] > WIDE * width / 4:
+    if fit.stderr[name] > UNDETERMINED_WIDTH * width / 4:
         return "not identifiable: its error is as wide as its bounds"
     tied = np.nan_to_num(np.abs(fit.correlation[k]))  # NaN with one at a bound
     tied[k] = 0
     other = int(np.argmax(tied)) if tied.size > 1 else k
-    return f"tied to {fit.names[other]}: correlation {fit.correlation[k][other]:.3f}" if tied[other] > ALIKE else ""
+    return f"tied to {fit.names[other]}: correlation {fit.correlation[k][other]:.3f}" if tied[other] > TIED else ""
 
 
 # A fit of critical loads alone, as in the paper: each method beside the others, with its cost against evaluations.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from srfcli.diagnosis.residual_scan import SIGNIFICANT
 from srfcli.results.figures import draw_loads, envelope, imposed_scale, settle
 from srfcli.results.plots import DOTTED, _gaps, bare_figure, curve_style, decade_ticks, house_style, name_text, new_figure
 from srfcli.results.report_text import finite, number, with_unit
@@ -24,12 +25,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 OBSERVED, BEFORE, AFTER, GUILTY = "#333333", "#D55E00", "#0072B2", "#E69F00"
-BLOCKS, LEAST = 60, 24  # pieces of a run whose residual is judged, samples that make a piece
+PIECES, PIECE_SAMPLES = 60, 24  # pieces of a run whose residual is judged, samples that make a piece
 RESIDUAL_COLUMNS = 360  # in which a residual is drawn by its extremes
 DOTS = 700  # samples that are drawn one by one
-CLOSE_UP, FEWEST = 7, 80  # periods of what is missing that a close-up shows, samples at least
-MOST, SHORT = 0.6, 0.12  # of the misfit, in a part of the run so short that it deserves a close-up
-PEAK = 0.3  # of a residual's power in one line, from which it has a period
+CLOSE_UP_PERIODS, CLOSE_UP_SAMPLES = 7, 80  # periods of what is missing that a close-up shows, samples at least
+MOST_OF_MISFIT, SHORT_PART = 0.6, 0.12  # of the misfit, in a part of the run so short that it deserves a close-up
+PEAK_SHARE = 0.3  # of a residual's power in one line, from which it has a period
 CLOSE_UP_POWER = 2.0  # of the noise's variance: less than that needs no close-up
 ZOOM = 0.3  # of a run: a close-up of more would show nothing new
 LOAD_PANEL = 1e-3  # relative variation of a load from which it is worth a panel
@@ -114,7 +115,7 @@ def rms_over_noise(z: Array) -> float:
 
 def local_rms(t: Array, z: Array) -> tuple[Array, Array]:
     """Return the borders (k + 1,) of pieces of a run in s and the rms (k,) of the residual in each."""
-    pieces = np.array_split(np.arange(t.size), max(min(BLOCKS, t.size // LEAST), 1))
+    pieces = np.array_split(np.arange(t.size), max(min(PIECES, t.size // PIECE_SAMPLES), 1))
     borders = [t[p[0]] for p in pieces if p.size] + [t[-1]]
     return np.asarray(borders), np.asarray([rms_over_noise(z[p]) for p in pieces if p.size])
 
@@ -336,26 +337,26 @@ def _near(axes: Sequence[Axes], one: Trace, part: slice) -> None:
 def close_up(one: Trace) -> slice | None:
     """Return the samples of a close-up: a short stretch that holds most of the misfit, or some periods of a fast one."""
     n = one.t.size
-    if n < 2 * FEWEST:
+    if n < 2 * CLOSE_UP_SAMPLES:
         return None
     over = np.maximum(_smooth(one.before**2, max(n // 200, 5)) - 1.0, 0.0)
     if float(over.max()) < CLOSE_UP_POWER or not over.any():
         return None
     sums = np.concatenate([[0.0], np.cumsum(over)])
-    ends = np.searchsorted(sums, sums[:-1] + MOST * sums[-1])  # the shortest stretch that holds most of it
+    ends = np.searchsorted(sums, sums[:-1] + MOST_OF_MISFIT * sums[-1])  # the shortest stretch that holds most of it
     lengths = np.where(ends <= n, ends - np.arange(n), n)
     a = int(np.argmin(lengths))
     size = int(lengths[a])
-    if size <= SHORT * n:
-        return _around(a + size // 2, max(3 * size, FEWEST), n)
+    if size <= SHORT_PART * n:
+        return _around(a + size // 2, max(3 * size, CLOSE_UP_SAMPLES), n)
     power = over if one.worst is None else np.where((one.t >= one.worst[0]) & (one.t <= one.worst[1]), over, 0.0)
-    middle = int(np.argmax(_smooth(power, FEWEST)))
+    middle = int(np.argmax(_smooth(power, CLOSE_UP_SAMPLES)))
     near = _around(middle, 1024, n)
     z = one.before[near] - one.before[near].mean()
     spectrum = np.abs(np.fft.rfft(z * np.hanning(z.size))) ** 2
     peak = int(np.argmax(spectrum[1:])) + 1
-    length = max(CLOSE_UP * z.size // peak, FEWEST)
-    tall = float(spectrum[max(peak - 2, 1) : peak + 3].sum()) > PEAK * float(spectrum[1:].sum())
+    length = max(CLOSE_UP_PERIODS * z.size // peak, CLOSE_UP_SAMPLES)
+    tall = float(spectrum[max(peak - 2, 1) : peak + 3].sum()) > PEAK_SHARE * float(spectrum[1:].sum())
     return _around(middle, length, n) if tall and float(np.var(z)) > CLOSE_UP_POWER and length <= ZOOM * n else None
 
 
@@ -389,7 +390,6 @@ def _pieces(t: Array) -> list[tuple[int, int]]:
 PANEL_BINS = 3  # of an axis, from which it has a panel of its own
 SPECTRUM_COLUMNS = 240  # columns in which a spectrum is drawn by its maxima
 THIN = 0.003  # of an axis: a bin so narrow is a line, as it would hardly be seen as a bar
-SIGNIFICANT = 0.01  # of the p-value adjusted for all that was looked at
 WIDE_AXIS = 100.0  # ratio from which an axis is logarithmic
 APART = ("run", "window")  # axes that the figures of the runs show
 
@@ -408,7 +408,7 @@ AXES: dict[str, tuple[str, str]] = {
     "position": ("place on the track", "µm"),
     "slip": ("slip", "µm"),
 }
-ROUNDING = 1e-9  # of an interval's other end: an end below is zero
+ZERO_END = 1e-9  # of an interval's other end: an end below is zero
 
 
 @dataclass(frozen=True)
@@ -437,7 +437,7 @@ class Spot:
         """Return the place in words, with its unit."""
         if self.axis == "frequency" or self.low == self.high:
             return with_unit(number(0.5 * (self.low + self.high)), self.unit)
-        least = ROUNDING * max(abs(self.low), abs(self.high))
+        least = ZERO_END * max(abs(self.low), abs(self.high))
         low, high = (0.0 if abs(end) < least else end for end in (self.low, self.high))
         return with_unit(f"{number(low)} to {number(high)}", self.unit)
 

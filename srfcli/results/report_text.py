@@ -9,7 +9,7 @@ from typing import Any, TypeGuard
 
 SMALLEST_P = 1e-290
 NO_BREAK = "\u00a0"  # between a number and its unit no line breaks
-ROUNDING = 1e-12  # of a value: an error below it is rounding
+NO_ERROR = 1e-12  # of a value: an error below it is rounding
 PLAIN = (1e-4, 1e6)  # between these a number is written without a power of ten
 SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
@@ -206,7 +206,7 @@ def bracketed(value: Any, error: Any) -> str:
         return "–"
     if not finite(error) or error <= 0:
         return number(value, 4)
-    if error < ROUNDING * abs(value):
+    if error < NO_ERROR * abs(value):
         return number(value, 6)
     digits = 2 if int(f"{error:.0e}"[0]) < 3 else 1
     place = math.floor(math.log10(float(f"{error:.{digits - 1}e}"))) - digits + 1

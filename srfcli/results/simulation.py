@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Array = NDArray
 
 MANY_BREAKS = 50  # a recorded load has knots, not changes
-FEW_SAMPLES = 20  # show no oscillation
+OSCILLATION_SAMPLES = 20  # show no oscillation
 OTHERS = (  # what a record has beside the first observable, where it is asked for
     Column("elongation", "um", "what another gauge shows"),
     Column("force", "N", "what another gauge shows"),
@@ -331,7 +331,7 @@ def _stretches(job: Job, t: Array) -> Iterator[tuple[int, int, float]]:
     cuts = np.unique([0, *np.searchsorted(t, changes), t.size]).tolist()
     for a, b in pairwise(cuts):
         V, rate, _ = job.drive.piece(0.5 * float(t[a] + t[b - 1]))
-        if V > 0 and not rate and b - a > FEW_SAMPLES:
+        if V > 0 and not rate and b - a > OSCILLATION_SAMPLES:
             yield a, b, V
 
 

@@ -223,7 +223,7 @@ PLACE_UNITS = {"slip": "um", "stage": "um", "time": "s", "theta": "1", "envelope
 MOVING = {"slip", "stage", "time", "theta", "envelope"}  # an effect of these is steady nowhere
 CHECKED_RUN = {"V": 9.0, "W0": 6.0, "eps": 0.1, "f": 110.0, "psi": 0.4, "onset0": 0.5, "rise0": 0.3, "modulated": 1.0}
 POINTS = 24
-RTOL = 1e-9
+AGREEMENT = 1e-9
 
 
 def check_effect(effect: Effect, registry: Registry) -> list[Outcome]:
@@ -346,8 +346,8 @@ class _EffectCheck:
         steady = np.asarray(self.model.steady(self.p_neutral))[:own]
         start = _difference(steady, np.asarray(self.plain.steady(_vector(self.plain))))
         told = ", ".join(f"{n} = {v:g}" for n, v in self.effect.neutral) or "any value"
-        if not max(worst, start) < RTOL:
-            where, size = ("the rates", worst) if not worst < RTOL else ("steady sliding", start)
+        if not max(worst, start) < AGREEMENT:
+            where, size = ("the rates", worst) if not worst < AGREEMENT else ("steady sliding", start)
             raise SrfError(
                 f"at {told} {where} differ from the baseline's by {size:.2g} of their size", "The effect must vanish there."
             )
@@ -377,7 +377,7 @@ class _EffectCheck:
             return np.asarray(model.reading(x[:, : len(model.states)], V, W, W_dot, p))
 
         plain = read(self.plain, _vector(self.plain))
-        if not (off := _difference(read(self.model, self.p_neutral), plain)) < RTOL:
+        if not (off := _difference(read(self.model, self.p_neutral), plain)) < AGREEMENT:
             what = f"at the neutral values the reading differs by {off:.2g} of its size"
             raise SrfError(what, "The formula must be `gauge` alone there.")
         moved = _difference(read(self.model, _vector(self.model)), plain)
@@ -409,7 +409,7 @@ class _EffectCheck:
         for found, expected, names in zip(exact, stepped, (model.states, model.names), strict=True):
             for j, name in enumerate(names):
                 error = _difference(np.asarray(found)[:, :, j], expected[:, :, j])
-                if not error < RTOL:
+                if not error < AGREEMENT:
                     raise SrfError(f"d(rates)/d({name}) differs from the complex step by {error:.2g} of its size")
                 worst = max(worst, error)
         counted = f"{len(model.states)} unknowns and {len(model.names)} parameters"

@@ -20,7 +20,7 @@ from srfcli.core.settings import Parameter, check_value, require_parameter
 from srfcli.core.units import find_unit, from_base, parse_quantity, split_quantity, tidy, to_base
 from srfcli.data.description import MOST_OBSERVABLES
 from srfcli.data.noise import FrictionField, check_gauge, generator
-from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
+from srfcli.data.values import BOUND_FACTOR, OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
 from srfcli.data.writing import stiffness_text
 from srfcli.inference.prediction import modulation_of, of_run
 from srfcli.laws.law_file import RESERVED
@@ -188,7 +188,6 @@ def read_gauges(
 STEEPEST = 1.875  # slope of a modulation's rise at its middle, over that of a straight line
 FINE = 20_000  # times at which a load is looked at for a modulation
 REFERENCE_PARAMETERS = ("V0",)  # the velocity that mu0 refers to: not identifiable beside mu0
-BOUND_FACTOR = 5.0  # ratio of the bounds of a fit to the value
 
 
 def record_of(

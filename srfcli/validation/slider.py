@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 
 # Rough tracks: a friction coefficient that wanders with position, the same for all runs of a case.
 
-KNOT_SPACING = 0.1  # correlation lengths between knots
+KNOTS_APART = 0.1  # correlation lengths between knots
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Track:
         """Return mu0's deviation as a function of position (um) from 0 to `longest`; beyond it stays at its last value."""
         if not self.size:
             return lambda x: 0.0
-        step = KNOT_SPACING * self.length
+        step = KNOTS_APART * self.length
         heights, slopes = self._knots(int(np.ceil(longest / step)) + 2)
         last = len(heights) - 2
 
@@ -63,7 +63,7 @@ class Track:
         Each knot takes the next two numbers of the stream, so that a longer profile begins with the shorter one.
         """
         draws = np.random.default_rng(self.seed).standard_normal((count, 2))
-        h = KNOT_SPACING
+        h = KNOTS_APART
         carry = np.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])  # of height and slope, by correlation lengths
         spread = np.linalg.cholesky(np.eye(2) - carry @ carry.T)
         state = draws[0]
@@ -185,7 +185,7 @@ class Physics:
 # What is done to the slider: seven runs, two of them held out, with drives and loads drawn around those of the examples.
 
 MODULATION_RISE = 0.02  # s, of the tanh that switches a modulation on
-STEP_RISE = 0.03  # s, of the tanh of a load step
+LOAD_STEP_RISE = 0.03  # s, of the tanh of a load step
 SPARSE = 5  # one sample in so many is kept where a recorder is slowed down
 WIDEST_JITTER = 0.4  # of the interval: how far from its place an uneven sample may be
 
@@ -240,7 +240,7 @@ class Plan:
 
     def load(self) -> Callable[[float], tuple[float, float]]:
         """Return the imposed load and its rate, N and N/s, as a function of time."""
-        W0, jumps, step_rise = self.W0, self.steps, self.rise or STEP_RISE
+        W0, jumps, step_rise = self.W0, self.steps, self.rise or LOAD_STEP_RISE
         share, omega, height = self.switched(), 2 * math.pi * self.f, self.eps * self.W0
 
         def load(t: float) -> tuple[float, float]:
@@ -535,12 +535,12 @@ def _massless(p: Physics) -> Contact:
 
 # The run of a slider from steady sliding: states joined, integrated by backward differentiation formulas, read by a gauge.
 
-RTOL = 1e-8
+SOLVER_RTOL = 1e-8
 TOLERANCES = {"u": 1e-8, "z": 1e-6, "e": 1e-10, "D": 1e-9, "s": 1e-7}  # absolute tolerances, um and um/s; others 1e-8
 LONGEST_STEP = 0.01  # s: no step jumps over the beginning of a load step
 FASTEST_WITHOUT_MASS = 1e6  # um/s: unstable slip without inertia becomes infinitely fast, and a solver may step over that
 OVERSHOOT = 60.0  # um, of slip beyond the stage's displacement
-MOST_STEPS = 200_000  # from one sample to the next
+STEPS_BETWEEN = 200_000  # from one sample to the next
 Array = np.ndarray
 
 
@@ -650,7 +650,7 @@ class Trace:
         return bool(np.isfinite(self.u).all())
 
 
-def move(p: Physics, plan: Plan, *, rtol: float = RTOL) -> Trace:
+def move(p: Physics, plan: Plan, *, rtol: float = SOLVER_RTOL) -> Trace:
     """Return the motion of one run at its sample times, integrated anew from every step of the drive."""
     slider = Slider(p, plan)
     t = plan.times()
@@ -668,11 +668,11 @@ def move(p: Physics, plan: Plan, *, rtol: float = RTOL) -> Trace:
 
 
 def _solver(slider: Slider, rtol: float) -> ode:
-    tolerance = [TOLERANCES.get(name, 1e-8) * rtol / RTOL for name in slider.names]
+    tolerance = [TOLERANCES.get(name, 1e-8) * rtol / SOLVER_RTOL for name in slider.names]
     longest = slider.plan.rise / 3 if slider.plan.rise else LONGEST_STEP
     if slider.plan.eps:
         longest = min(longest, 0.25 / slider.plan.f)
-    options = {"rtol": rtol, "atol": tolerance, "nsteps": MOST_STEPS, "max_step": longest}
+    options = {"rtol": rtol, "atol": tolerance, "nsteps": STEPS_BETWEEN, "max_step": longest}
     # with_jacobian: Newton's method with differences; without it VODE iterates the stiff equations as they stand
     return ode(slider.rates).set_integrator("vode", method="bdf", with_jacobian=True, **options)
 
@@ -698,8 +698,8 @@ def _through(slider: Slider, solver: ode, trace: Trace, end: float) -> Array | N
 UNSTEADY: dict[str, Any] = {
     "track": Track(), "topo": 0.0, "bump": 0.0, "drift_t": 0.0, "drift_x": 0.0, "ripple": 0.0, "drive_tau": 0.0,
 }  # fmt: skip
-UNFELT: dict[str, Any] = {"lag": 0.0, "creep": 0.0, "servo": 0.0}  # of gauge and servo: steady sliding does not feel them
-LOADS_TRIED = 60  # that are tried, evenly in their logarithm
+UNFELT_DELAYS: dict[str, Any] = {"lag": 0.0, "creep": 0.0, "servo": 0.0}  # of gauge and servo: steady sliding does not feel them
+SIZES_OF_LOAD = 60  # that are tried, evenly in their logarithm
 STATE_DIFFERENCE = 1e-4  # relative, of a state: a critical load is 2e-5 off; the friction law is inverted to some 1e-10
 
 
@@ -708,7 +708,7 @@ def critical_load(p: Physics, V: float, low: float, high: float) -> float:
 
     What depends on place or time has no steady sliding, and is left out.
     """
-    p = replace(p, **UNSTEADY, **UNFELT)
+    p = replace(p, **UNSTEADY, **UNFELT_DELAYS)
 
     def growth(ln_W: float) -> float:
         slider = Slider(p, Plan("steady", ((1.0, V),), math.exp(ln_W), 0.1))
@@ -721,7 +721,7 @@ def critical_load(p: Physics, V: float, low: float, high: float) -> float:
             J[:, column] = (above - below) / (2 * step[i])
         return float(np.linalg.eigvals(J).real.max()) if np.isfinite(J).all() else math.nan
 
-    grid = np.linspace(math.log(low), math.log(high), LOADS_TRIED)
+    grid = np.linspace(math.log(low), math.log(high), SIZES_OF_LOAD)
     found = np.array([growth(x) for x in grid])
     lost = np.flatnonzero((found[:-1] < 0) & (found[1:] >= 0))
     return math.exp(brentq(growth, grid[lost[0]], grid[lost[0] + 1], xtol=1e-9)) if lost.size else math.nan
