@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 import srfcli
 from srfcli.cli.main import cli
 from srfcli.diagnosis.search import ModelSearch
-from srfcli.diagnosis.verdict import conclude
+from srfcli.diagnosis.verdict import Diagnosis, conclude
 from srfcli.laws.registry import load_registry
 from srfcli.results.diagnosis import DiagnosisResult
 
@@ -58,6 +58,14 @@ def joined(out: Path, **recordings: Sequence[object]) -> Path:
     return out / "experiment.toml"
 
 
+def concluded(description: Path, *effects: str) -> Diagnosis:
+    """What a diagnosis concludes, without the closed form that would follow."""
+    experiment = srfcli.read_experiment(description)
+    search = ModelSearch(load_registry(()), experiment, effects=effects)
+    search.run()
+    return conclude(search, experiment)
+
+
 def test_runs_whose_gauges_are_not_alike_have_a_noise_each(tmp_path: Path) -> None:
     description = joined(tmp_path, quiet=(), loud=("--noise", "0.012"), second=())
     found = srfcli.diagnose(description, effects=["second-state", "stiffness-error"])
@@ -69,10 +77,7 @@ def test_runs_whose_gauges_are_not_alike_have_a_noise_each(tmp_path: Path) -> No
 
 def test_a_parameter_that_is_another_in_one_run_is_told(tmp_path: Path) -> None:
     description = joined(tmp_path, one=(), two=(), three=("--set", "D0=8"))
-    experiment = srfcli.read_experiment(description)
-    search = ModelSearch(load_registry(()), experiment, effects=["stiffness-error"])
-    search.run()
-    found = conclude(search, experiment)
+    found = concluded(description, "stiffness-error")
     told = [r for r in found.reasons if "--vary D0" in r]
     assert found.verdict == "unknown" and told, found.reasons
     assert re.match(r"D0 of three alone, about [\d.]+ um where the baseline has [\d.]+ um, would gain \d+ ", told[0]), told
@@ -86,9 +91,8 @@ def test_a_free_start_is_diagnosed_where_an_effect_brings_an_age_of_its_own(tmp_
 
 
 def test_a_start_that_is_not_steady_is_told(tmp_path: Path) -> None:
-    restated(record(tmp_path / "run", "--start", "phi=0.3 s"), ('initial = "free"\n', ""))
-    found = srfcli.diagnose(tmp_path / "run", effects=["second-state"])
-    told = [r for r in found.diagnosis.reasons if 'with initial = "free"' in r]
+    found = concluded(restated(record(tmp_path / "run", "--start", "phi=0.3 s"), ('initial = "free"\n', "")), "second-state")
+    told = [r for r in found.reasons if 'with initial = "free"' in r]
     assert found.verdict == "unknown" and told and "every test is passed" in told[0]
 
 
