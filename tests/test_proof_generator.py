@@ -118,14 +118,14 @@ def slow_unless_quick(law, ageing):
     return pytest.param(law, ageing, marks=() if (law, ageing) in QUICK else pytest.mark.slow)
 
 
-def predicted(make_model, folder, p, plan, rig, u):
+def predicted(make_model, folder, p, plan, rig, u, effects=(), **own):
     """Return what the fitter predicts for a case whose parameters are those of the generator's slider."""
     for name, text in case_files("neutral", p, {plan: u}, rig=rig).items():
         (folder / name).write_text(text)
     experiment = read_experiment(folder, registry=load_registry())
-    model = make_model(**asdict(experiment.choice), stability=False)
+    model = make_model(**asdict(experiment.choice.plus(effects)), stability=False)
     values = {LAW_NAMES.get(n, n): getattr(p, n) for n in (*OF_LAW[p.law_name], "lam", "nagata", "V0")}
-    values = {n: v for n, v in {**values, "Vb": p.Vsat}.items() if n in model.names}
+    values = {n: v for n, v in {**values, "Vb": p.Vsat, **own}.items() if n in model.names}
     made = predict(model, experiment, experiment.runs[0], values, rtol=1e-9)
     assert made.status.ok
     return made.y
@@ -140,6 +140,19 @@ def test_every_law_and_ageing_law_agrees_with_the_fitter_on_rock(make_model, tmp
     assert np.ptp(u) > 0.05
     made = predicted(make_model, tmp_path, p, ROCK_RUN, RIGS["rock-friction"], u)
     assert np.abs(made - u).max() < 5e-7  # of friction; good recordings have noise of 1e-4
+
+
+@pytest.mark.parametrize(
+    ("effect", "fields", "own"),
+    [("second-state", ("B2", "D2"), {"B2": 0.004, "D2": 90.0}), ("viscous-drag", ("drag",), {"c": 5e-4})],
+    ids=["second-state", "viscous-drag"],
+)
+def test_an_effect_with_a_reference_velocity_joins_a_law_that_has_none(make_model, tmp_path, effect, fields, own):
+    bare = with_laws(ROCK, 0.65, np.random.default_rng(1), Setting("rock", "steps", "dieterich-cutoff", "dieterich", "dieterich"))
+    p, rig = replace(bare, **dict(zip(fields, own.values(), strict=True))), RIGS["rock-friction"]
+    with_it, without = (recorded(rig, q, ROCK_RUN, move(q, ROCK_RUN).u) for q in (p, bare))
+    made = predicted(make_model, tmp_path, p, ROCK_RUN, rig, with_it, (effect,), **own)
+    assert np.abs(made - with_it).max() < 5e-7 and np.abs(with_it - without).max() > 1e-3
 
 
 @pytest.mark.parametrize(("law", "ageing"), [slow_unless_quick(law, ageing) for law in LAWS for ageing in AGEING_LAWS])

@@ -11,7 +11,7 @@ import numpy as np
 from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base, to_base
 from srfcli.data.values import CriticalLoads, FitParameter, Run
-from srfcli.laws.values import Effect
+from srfcli.laws.values import REFERENCE_VELOCITY, Effect
 
 
 def scales_of(runs: Sequence[Run], parameters: Sequence[FitParameter], tables: Sequence[CriticalLoads] = ()) -> dict[str, float]:
@@ -19,11 +19,11 @@ def scales_of(runs: Sequence[Run], parameters: Sequence[FitParameter], tables: S
 
     `segment` is the longest slip at one velocity and `track` in one run, `duration` that of the longest run, `interval` the
     shortest between samples, `V_low` and `V_high` the range of the drive while it moves, `load` the mean of the normal load. D0
-    and V0 are the model's start values, and are missing where the model has none. Without runs, V_low, V_high and load are those
-    of the tables of critical loads, which have no other scale.
+    and V0 are the model's start values; where the model has none, D0 is missing, and V0 is 1 um/s. Without runs, V_low, V_high
+    and load are those of the tables of critical loads, which have no other scale.
     """
     found = _of_runs([run for run in runs if not run.holdout] or list(runs)) if runs else _of_tables(tables)
-    found |= {q.name: q.value for q in parameters if q.name in ("D0", "V0")}
+    found |= {"V0": REFERENCE_VELOCITY.default} | {q.name: q.value for q in parameters if q.name in ("D0", "V0")}
     return {name: value for name, value in found.items() if 0 < value < math.inf}
 
 

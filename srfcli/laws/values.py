@@ -12,6 +12,9 @@ from srfcli.core.settings import Parameter
 if TYPE_CHECKING:
     import sympy
 
+# where an effect has a reference velocity and the friction law has none
+REFERENCE_VELOCITY = Parameter("V0", 1.0, "um/s", 1e-12, about="reference velocity, no physical meaning of its own")
+
 
 @dataclass(frozen=True)
 class State:

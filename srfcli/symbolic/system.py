@@ -17,7 +17,17 @@ from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
 from srfcli.core.units import dimension
 from srfcli.laws.expression import symbol
-from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, ExtraState, FrictionLaw, Interface, Law, State
+from srfcli.laws.values import (
+    REFERENCE_VELOCITY,
+    AgeingLaw,
+    AgeingModifier,
+    Effect,
+    ExtraState,
+    FrictionLaw,
+    Interface,
+    Law,
+    State,
+)
 
 if TYPE_CHECKING:
     from srfcli.laws.registry import Registry
@@ -111,6 +121,8 @@ class System:
                 if parameter.name not in seen:
                     own.append(parameter)
                     seen.add(parameter.name)
+        if "V0" not in seen and any(symbol("V0") in f.free_symbols for effect in self.effects for f in formulas(effect)):
+            own.append(REFERENCE_VELOCITY)
         return tuple(own)
 
     @property
@@ -193,6 +205,11 @@ def with_effects(system: System, effects: Sequence[Effect]) -> System:
     return joined
 
 
+def formulas(effect: Effect) -> list[sp.Expr]:
+    """Return what an effect changes, and the rates and steady values of the states that it brings."""
+    return [*(f for _, f in effect.changes), *(f for x in effect.states for f in (x.rate, x.steady))]
+
+
 def in_a_model(law: Law) -> tuple[Parameter, ...]:
     """Return a law's parameters as a model has them: bounds that follow a recording bound a search, and leave the sign alone."""
     if not isinstance(law, Effect):
@@ -242,8 +259,7 @@ def _check_symbols(system: System) -> None:
     inputs = {"v", "W", "mu", "mu_dot", "W_dot", "F_dot_over_W", *(s.name for s in system.friction.states)}
     _check_apart(system)
     for effect in system.effects:
-        formulas = [*(f for _, f in effect.changes), *(e for x in effect.states for e in (x.rate, x.steady))]
-        lacking = sorted({str(s) for f in formulas for s in f.free_symbols} - declared - inputs - {*EFFECT_INPUTS})
+        lacking = sorted({str(s) for f in formulas(effect) for s in f.free_symbols} - declared - inputs - {*EFFECT_INPUTS})
         lacking = [name for name in lacking if name not in {x.name for e in system.effects for x in e.states}]
         if lacking:
             raise SrfError(
