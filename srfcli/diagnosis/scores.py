@@ -513,7 +513,9 @@ def _carried(
     fine_t = (run.t[:-1, None] + np.diff(run.t)[:, None] * steps).ravel()
     V = run.drive(fine_t)
     stage = np.concatenate([[0.0], np.cumsum(V * np.repeat(np.diff(run.t) / POINTS_BETWEEN, POINTS_BETWEEN))])
-    inputs, shown = np.zeros((n, a, len(functions) + late)), np.zeros(n)
+    signals, known, shown = len(run.signals), every.kept, np.zeros(n)
+    moved = np.zeros((every.nu.size, a, len(functions) + late))  # the states expected, of each column
+    inputs = moved[::signals]
     if late:
         shown = -_elongation_rate(run, kept.mean, model, fitted)
     at, slope = states.index("field"), states.index("field_slope")
@@ -531,17 +533,14 @@ def _carried(
             inputs[0, : len(states), j] = start * g[0]
         else:
             middle = 0.5 * (stage[1:] + stage[:-1])
-            moved = V * np.broadcast_to(np.asarray(shape.g(middle, *inner), dtype=float), middle.shape)
-            total = (moved.reshape(-1, POINTS_BETWEEN) * (np.diff(run.t) / POINTS_BETWEEN)[:, None]).sum(axis=1)
+            gained = V * np.broadcast_to(np.asarray(shape.g(middle, *inner), dtype=float), middle.shape)
+            total = (gained.reshape(-1, POINTS_BETWEEN) * (np.diff(run.t) / POINTS_BETWEEN)[:, None]).sum(axis=1)
             if by_V is None:
                 by_V = _rates_by_V(model, fitted, run, kept.mean[:, : len(states)])
             inputs[1:, : len(states), j] = 0.5 * (by_V[1:] + by_V[:-1]) * total[:, None]
-    signals, known = len(run.signals), every.kept
     lost = np.einsum("kij,kj->ki", known.transition[1:], gains(every, f.taken)[:-1])  # of what a reading shows, by the next one
     through = known.transition.copy()
     through[1:] -= lost[:, :, None] * known.gradient[:-1, None, :]
-    moved = np.zeros((every.nu.size, a, inputs.shape[2]))  # the states expected, of each column
-    moved[::signals] = inputs
     if late:  # a delay is that of the first signal's gauge
         moved[1::signals, :, -1] -= (lost * np.repeat(shown, signals)[:-1, None])[::signals]
     for k in range(1, len(moved)):
