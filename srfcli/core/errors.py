@@ -8,9 +8,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+LONGEST_MESSAGE = 2000  # characters of a message
 # control characters but tab and newline, DEL and the second set, marks that are not seen or turn the line round, lone
 # surrogates (bytes of file names that are no text): what a terminal acts on, or shows as something else than it is
-LONGEST_MESSAGE = 2000  # characters of a message
 _UNSEEN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
     "\ud800-\udfff\U000e0000-\U000e0fff]"

@@ -192,8 +192,7 @@ def without_part(effect: Effect) -> str:
     """Return why critical loads do not depend on an effect: as a clause that follows its name, or nothing where they do."""
     if effect.observed or (effect.changes and all(slot == "gauge" for slot, _ in effect.changes)):
         return "changes what the gauge shows, not how the slider moves"
-    formulas = [*(f for _, f in effect.changes), *(e for x in effect.states for e in (x.rate, x.steady))]
-    used = {str(s) for f in formulas for s in f.free_symbols}
+    used = {str(s) for f in formulas(effect) for s in f.free_symbols}
     along = next((name for name in PASSING if name in used), "")
     return f"changes with {PASSING[along]}, so that no sliding is steady" if along else ""
 

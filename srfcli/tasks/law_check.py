@@ -25,7 +25,7 @@ from srfcli.laws.law_file import COMMON, FORMULA, formula_of, kind_of
 from srfcli.laws.registry import Registry, bundled_registry
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, FrictionLaw, Interface, Law, State
 from srfcli.symbolic.equations import CHECKED_LOAD, CHECKED_VELOCITIES, steady_age_formula
-from srfcli.symbolic.system import System, build_system, with_effects
+from srfcli.symbolic.system import System, build_system, formulas, with_effects
 
 # What `srf law check` asks of a law: units, steady state, mu_v > 0, derivatives, worked values.
 
@@ -386,8 +386,7 @@ class _EffectCheck:
         return f"at the default values the reading moves by up to {moved:.2g} of the largest"
 
     def steady_start(self) -> str:
-        formulas = [*(f for _, f in self.effect.changes), *(f for s in self.effect.states for f in (s.rate, s.steady))]
-        used = {str(s) for f in formulas for s in f.free_symbols} & MOVING
+        used = {str(s) for f in formulas(self.effect) for s in f.free_symbols} & MOVING
         if used:
             raise Skipped(f"with {', '.join(sorted(used))} in the formula nothing is steady")
         p = _vector(self.model)
