@@ -52,6 +52,23 @@ def test_mass_and_compliance_are_found_from_twice_their_values(tmp_path):
         assert any("--starts 5" in note for note in own.table.notes) is told
 
 
+def test_sudden_falls_are_fitted_from_a_slider_that_would_not_stick(tmp_path):
+    """A light slider on a soft spring falls between two samples; the start values have A = B, and slide steadily."""
+    slider = (
+        "--law dieterich-ruina --ageing ruina --interface rigid --W0 0.6 --K 0.00744 --set A=0.0127 --set B=0.0184 --set D0=0.07"
+    )
+    run = "--set mu0=0.317 --drive 1:3.3,5:1.5,2:4 --rate 250 --noise 0.013 --seed 6"
+    words = [*slider.split(), "--M", "3.36e-3 kg", *run.split(), "--free", "mu0,A,B,D0", "--out-dir", str(tmp_path / "made")]
+    assert CliRunner().invoke(cli, ["simulate", *words]).exit_code == 0
+    experiment = srf.read_experiment(tmp_path / "made")
+    truth = {q.name: q.value for q in experiment.parameters}
+    start = truth | {"mu0": 0.38, "A": 0.01, "B": 0.01}
+    found = srf.fit(replace(experiment, parameters=tuple(replace(q, value=start[q.name]) for q in experiment.parameters)))
+    assert found.status.ok
+    for name in ("mu0", "A", "B", "D0"):
+        assert abs(found.values[name] - truth[name]) < 4 * found.stderr[name] < 0.05 * truth[name], name
+
+
 @pytest.fixture(scope="module", params=[(3, 3, 3), (3, 4, 5)], ids=["one track", "own tracks"])
 def fitted(request, tmp_path_factory):
     folder, rng, base = tmp_path_factory.mktemp("rough"), np.random.default_rng(5), Physics()

@@ -212,7 +212,7 @@ def set_in(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("setting", "noise"), list(zip(SETTINGS, ("ar1", "spikes", "white", "1/f", "white", "gaps", "uneven"), strict=True))
+    ("setting", "noise"), list(zip(SETTINGS, ("ar1", "spikes", "one run louder", "1/f", "white", "gaps", "uneven"), strict=True))
 )
 def test_a_case_of_the_wide_bank_reads_back(set_in, tmp_path, setting, noise):
     """The reader finds the stated laws, and what it reads is what the truth predicts, to the gauge's noise."""
@@ -228,10 +228,12 @@ def test_a_case_of_the_wide_bank_reads_back(set_in, tmp_path, setting, noise):
     assert truth["accept"] == ([] if kind == "none" else ["slip-evolution"])
     for run, plan in zip(experiment.runs, known_plans(truth), strict=True):
         made = unread(rig, acting(truth, plan), plan) * (rig.factor if rig.observes == "force" else 1.0)
-        unit = gauge.sigma * (rig.factor if rig.observes == "force" else 1.0)
+        unit = gauge.louder(plan.loud).sigma * (rig.factor if rig.observes == "force" else 1.0)
         assert run.observable == rig.observes and np.allclose(run.t, plan.times(), atol=1e-6)
         assert 0.6 < rms((run.observed - made)[run.used]) / unit < 1.5  # 1/f noise of a short run wanders
         assert rms(run.load(run.t)[0] - [plan.load()(t)[0] for t in run.t.tolist()]) < 2e-3 * plan.W0
+    louder = [plan.loud for plan in known_plans(truth) if plan.loud > 1 and not plan.holdout]
+    assert len(louder) == (noise == "one run louder")
     text = b" ".join(contents(tmp_path / "c").values()).decode()
     assert not [n for n in (*NAMES, *OUTSIDE_NAMES, "effect", "rough", "seed", "truth") if n != "inertia" and n in text]
 

@@ -170,6 +170,31 @@ def test_derivatives_are_those_of_the_likelihood(rig):
     assert max(worst.values()) < 1e-3, worst  # stick-slip is the worst, and there the differences are
 
 
+def test_a_reading_moves_logarithms_and_field_no_farther_than_is_linear(make_model):
+    """A sudden fall that the model has not: velocity and age stay what can be followed, and derivatives exact."""
+    own, model = RIGS["paper"], make_model(**PMMA, random_field=True)
+    y = predict(model, own.experiment, own.run, own.values, rtol=1e-9).y
+    fallen = replace(own, run=replace(own.run, observed=np.where(own.run.t < 0.3, y, 0.1 * y)))
+    values = own.values | FIELD | {"gauge_white": 0.01}
+
+    def filtered(changed: dict[str, float], by: tuple[str, ...] = (), keep: bool = False) -> Any:
+        return filter_run(model, fallen.experiment, fallen.run, values | changed, by=by, rtol=1e-8, keep=keep)
+
+    by = ("A", "B", "D0", "field_amplitude")
+    exact = filtered({}, by)
+    assert exact.whole
+    kept = filtered({}, keep=True).found.kept
+    fall = int(np.argmax(fallen.run.t >= 0.3))
+    moved = kept.covariance[fall] @ kept.gradient[fall] / exact.found.S[fall] * exact.found.nu[fall]
+    states = list(model.states)
+    assert abs(moved[states.index("ln_v")]) > 4.0 and abs(moved[states.index("field")]) > 5.0 * FIELD["field_amplitude"]
+    for j, name in enumerate(by):
+        step = 1e-5 * values[name]
+        sides = [filtered({name: values[name] + sign * step}).found.nu for sign in (1, -1)]
+        nu_d = (sides[0] - sides[1]) / (2 * step)
+        assert np.abs(exact.found.nu_d[:, j] - nu_d).max() < 1e-3 * np.abs(nu_d).max(), name
+
+
 def test_derivatives_of_every_function_that_a_law_may_have(tmp_path, make_model):
     """One law with all of them, by a number that stands inside and before each."""
     x, functions = "log(v/V0)", ("exp", "log1p", "expm1", "sin", "cos", "sinh", "cosh", "tanh", "asinh", "atan")
@@ -191,8 +216,9 @@ def test_derivatives_of_every_function_that_a_law_may_have(tmp_path, make_model)
 
     def innovations(c: float) -> Any:
         known = values | FIELD | {"gauge_white": 0.01, "c": c}
-        return filter_run(model, own.experiment, run, known, by=["c"], rtol=1e-9).found
+        return filter_run(model, own.experiment, replace(run, observed=shown), known, by=["c"], rtol=1e-9).found
 
+    shown = predict(model, own.experiment, run, values, rtol=1e-9).y
     difference = (innovations(0.1001).nu - innovations(0.0999).nu) / 0.0002
     assert np.abs(innovations(0.1).nu_d[:, 0] - difference).max() < 1e-5 * np.abs(difference).max()
 

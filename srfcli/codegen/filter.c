@@ -427,12 +427,12 @@ static void fresh_gauge(Course *course, Belief *b, const dual *gauge) {
    GAUGE the elongation as the gauge has it, SPRING as it is, where spring weighs by `weighs` (nt), 0 or 1, with which parameter
    `weighed` is replaced (-1 for none); from 0 on a state. The processes of coloured noise have `order` (ng) states each, belong to
    the signal `owner` (ng), and have parameters gauge (rates, ng, 3); which of the rates holds at a reading is `rate` (nt): where it
-   changes, a noise begins that owes nothing to the one before. p holds dual numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and
-   P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset and R (nt). Returns how many readings were reached; stats: steps,
+   changes, a noise begins that owes nothing to the one before. A reading moves no state by more than `farthest` (NX). p holds dual
+   numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset, R (nt) and farthest. Returns how many readings were reached; stats: steps,
    rejected. */
-int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
+int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, const double *farthest, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
     double values[NP];
-    dual q[NP], colour[3 * GAUGE_PROCESSES * SIGNALS], y[NX], one, g[NX];
+    dual q[NP], colour[3 * GAUGE_PROCESSES * SIGNALS], y[NX], one, g[NX], bound[NX];
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values};
     Course course = {values, q, slopes, keep, ng, NX, order, rtol, 0.0, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
     Belief b;
@@ -446,6 +446,7 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
     for (int j = 0; j < ng; j++) begins[course.na] = 1 + owner[j], course.na += order[j];
     na = course.na;
     for (int i = 0; i < NX; i++) TAKE(one, x0 + i * wide), b.x[i] = one.v, b.xd[i] = one.d;
+    for (int i = 0; i < NX; i++) TAKE(bound[i], farthest + i * wide);
     for (int i = 0; i < NX; i++)
         for (int j = 0; j < NX; j++) TAKE(one, P0 + (i * NX + j) * wide), b.P[i * na + j] = one.v, b.Pd[i * na + j] = one.d;
     TAKE_COLOUR(rate[0]);
@@ -544,8 +545,14 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
                 add_scaled(na * LANES, -gain, dPH, b.Pd + i * na);
             }
             for (int j = 0; j < na; j++) b.P[i * na + j] -= gain * PH[j];
-            b.xd[i] += dgain * miss + gain * dmiss;
-            b.x[i] += gain * miss;
+            double move = gain * miss;
+            lanes dmove = dgain * miss + gain * dmiss;
+            if (i < NX && fabs(move) > bound[i].v) { /* the equations are not linear so far */
+                dmove = move < 0.0 ? -bound[i].d : bound[i].d;
+                move = copysign(bound[i].v, move);
+            }
+            b.xd[i] += dmove;
+            b.x[i] += move;
         }
     }
 end:

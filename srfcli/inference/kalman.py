@@ -19,6 +19,7 @@ from srfcli.core.errors import SrfError
 from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.integrators import doubles, imposed_arguments, interruptible, rtol_of_estimate
 
+FARTHEST_UPDATE = 3.0  # of what is linear: ln v and ln PHI by a factor of 20, the field by three of its standard deviations
 STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
 
 GAUGE, SPRING = -1, -2  # what a reading shows: the elongation as the gauge has it, or as it is; from 0 on a state
@@ -124,8 +125,10 @@ def kalman_filter(
     quality q and standard deviation s, (f, s, q). `rate` (n,) says which row holds at a sample, the first if left out; where it
     changes, a new noise begins.
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
-    numbers in the same k directions. After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a
-    compiler, or for a model without a random friction field.
+    numbers in the same k directions. A reading moves ln v, ln PHI and the field by no more than FARTHEST_UPDATE, as what it says
+    of them is linear: beside the fall of a stick-slip cycle that would be a velocity of any size, which cannot be followed. Each
+    reading is still predicted from those before it alone, so that the likelihood is one. After `most` steps, 50 a sample if left
+    out, the rest is NaN. Raises SrfError without a compiler, or for a model without a random friction field.
     """
     if "field_gain" not in model.namespace:
         raise SrfError(f"{model.title} has no random friction field", "open_model(..., random_field=True)")
@@ -147,7 +150,7 @@ def kalman_filter(
     stats, stop, reached = np.zeros(2), ctypes.c_int(0), n
     imposed, use = imposed_arguments(t, drive, load), np.ascontiguousarray(used, dtype=np.uint8)
     size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000) if most is None else most
-    allowed = np.asarray(atol) * size / rtol
+    allowed, farthest = np.asarray(atol) * size / rtol, _farthest(model, p)
     for first in range(0, max(k, 1), LANES):
         own_nu, own_S = np.full((n, LANES), np.nan), np.full((n, LANES), np.nan)
         keeping = keep and first == 0
@@ -159,14 +162,22 @@ def kalman_filter(
             int(k > 0), ctypes.c_double(size), doubles(allowed),
             ctypes.c_long(most), n,
             doubles(t), doubles(observed), ctypes.c_void_p(use.ctypes.data), doubles(factor.packed(first)),
-            doubles(offset.packed(first)), doubles(R.packed(first)), int(keeping), doubles(nu), doubles(S), doubles(own_nu),
-            doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),
+            doubles(offset.packed(first)), doubles(R.packed(first)), doubles(farthest.packed(first)), int(keeping), doubles(nu),
+            doubles(S), doubles(own_nu), doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),
         )  # fmt: skip
         reached = min(reached, interruptible(lambda arguments=arguments: library.srf_filter(*arguments), stop))  # type: ignore[misc]
         count = min(LANES, k - first)
         nu_d[:, first : first + count], S_d[:, first : first + count] = own_nu[:, :count], own_S[:, :count]
     kept = Kept(*arrays) if keep else None
     return Innovations(nu, S, nu_d, S_d, reached, int(stats[0]), kept)
+
+
+def _farthest(model: GeneratedModel, p: Dual) -> Dual:
+    """Return by how much a reading may move each state (n,), without end but for logarithms and the field."""
+    amplitude = model.index("field_amplitude")
+    random = np.array([s.startswith("field") for s in model.states])
+    unit = np.where(random, p.v[amplitude], [1.0 if s.startswith("ln_") else np.inf for s in model.states])
+    return Dual(FARTHEST_UPDATE * unit, FARTHEST_UPDATE * np.outer(random, p.d[amplitude]))
 
 
 @dataclass(frozen=True)

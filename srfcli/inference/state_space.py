@@ -55,6 +55,8 @@ FIELD = ("field_amplitude", "field_length")
 # while none leads near a maximum under a field that is narrower than it was
 WIDE = ((0.01, 3.0), (0.01, 10.0), (0.003, 1.0), (0.3, 1.0))
 SHORT = (1.0, 0.25, 0.06)  # lengths of faint fields that are tried, over the same
+TOO_LOUD = 3.0  # times the noise that a recording itself shows: more is left by a maximum that misses the falls of stick-slip
+QUIETER = 30.0  # times less noise than a recording itself shows, that it may have
 NOT_CONVERGED = 3.0  # standard errors from its maximum at which a fit is none
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
 LEAST_FIELD = 1e-6  # the least amplitude of a field, over the friction of the recordings
@@ -682,7 +684,7 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
         level = float(np.median([first_level(*each) for each in own]))
         quiet = min([level, *(max(_floor(*each), 1e-3 * level) for each in own)])
         found |= {
-            ("gauge_white", what): (level, quiet / 30, 100 * level),
+            ("gauge_white", what): (level, quiet / QUIETER, 100 * level),
             ("gauge_colour", what): (level, quiet / 100, 100 * level),
             ("gauge_time", what): (10 * spacing, spacing, longest),
             ("gauge_frequency", what): (0.1 / spacing, 1 / longest, FASTEST_OSCILLATION / spacing),
@@ -1239,15 +1241,17 @@ def _fitted(
         """Return the maximum from the first start that leads near one, or the likeliest that was reached from all.
 
         Under a field that is no narrower than the start's the filter follows the recordings whatever the parameters are: these
-        may have drifted to where no step leads back, and another start is tried.
+        may have drifted to where no step leads back, and another start is tried. So it is where TOO_LOUD times the noise of the
+        recordings themselves is left.
         """
         found: Maximum | None = None
-        at = wide.names.index("field_amplitude")
+        at, white = wide.names.index("field_amplitude"), np.array([n.startswith("gauge_white") for n in wide.names])
+        loud = np.where(white, wide.lower + np.log(TOO_LOUD * QUIETER), np.inf)
         for x in starts:
             other = maximise(wide, x, steps=SCORING_STEPS // 2 if fresh else 12, close=1.0, progress=progress)
             if found is None or other.point.log_likelihood > found.point.log_likelihood:
                 found = other
-            if other.away < NOT_CONVERGED and other.point.x[at] < x[at]:
+            if other.away < NOT_CONVERGED and other.point.x[at] < x[at] and (other.point.x < loud).all():
                 break
         return found
 

@@ -119,7 +119,8 @@ RIG_SHARES = {"paper": 0.25, "rock": 0.5, "micro": 0.25}  # some effects make se
 PROTOCOLS = {"mixed": 0.3, "steps": 0.2, "holds": 0.12, "load-steps": 0.14, "oscillation": 0.14, "stick-slip": 0.1}
 LAW_SHARES = {law: 0.25 if law in ("srf-vsat", "dieterich-ruina") else 0.1 for law in LAWS}
 AGEING_SHARES = dict(zip(AGEING_LAWS, (0.4, 0.3, 0.1, 0.1, 0.1), strict=True))
-NOISE_SHARES = {"white": 0.25, "ar1": 0.2, "1/f": 0.2, "spikes": 0.1, "gaps": 0.1, "uneven": 0.15}
+NOISE_SHARES = {"white": 0.2, "ar1": 0.15, "1/f": 0.2, "spikes": 0.1, "gaps": 0.1, "uneven": 0.15, "one run louder": 0.1}
+LOUDER = (1.5, 5.0)  # times the others' noise, in one run
 # (true, stated) and how often: the two that laboratories take for each other, and two that nothing but their name tells of
 WRONG_AGEING = {
     ("ruina", "dieterich"): 0.35,
@@ -466,13 +467,16 @@ def draw_gauge(rng: np.random.Generator, rig: str, p: Physics, noise: str) -> Ga
 
 
 def disturbed(rng: np.random.Generator, plans: Sequence[Plan], noise: str) -> tuple[Plan, ...]:
-    """Return runs with the gaps, or the uneven sampling, of a kind of noise.
+    """Return runs with the gaps, the uneven sampling, or the one louder run of a kind of noise.
 
     No gap falls where the load changes, as nobody would know how; a recorder is slowed down where the load is constant.
     """
-    out = []
+    fitted, out = [plan.name for plan in plans if not plan.holdout], []
+    loud = str(rng.choice(fitted)) if noise == "one run louder" else ""
     for plan in plans:
-        if noise == "gaps" and not plan.eps:
+        if plan.name == loud:
+            plan = replace(plan, loud=float(f"{np.exp(rng.uniform(*np.log(LOUDER))):.3g}"))
+        elif noise == "gaps" and not plan.eps:
             begin = float(f"{plan.duration * rng.uniform(0.15, 0.85):.3g}")
             gap = (begin, float(f"{begin + plan.duration * rng.uniform(0.01, 0.05):.4g}"))
             near = 4 * (plan.rise or 0.03)

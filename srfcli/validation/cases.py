@@ -512,7 +512,10 @@ def make_case(
     asked = Asked(kind, effects, size, rough, own)
     recipe, motions, attempt = _moving(seed, draw_wide if bank == "wide" else draw_recipe, asked)
     rng, rig = np.random.default_rng([*_whole(seed), attempt, 1]), RIGS[recipe.rig]
-    readings = {plan: read_gauge(recorded(rig, recipe.acting(plan), plan, u), recipe.gauge, rng) for plan, u in motions.items()}
+    readings = {
+        plan: read_gauge(recorded(rig, recipe.acting(plan), plan, u), recipe.gauge.louder(plan.loud), rng)
+        for plan, u in motions.items()
+    }
     truth = _truth(recipe, attempt, seed)
     if strengths:
         truth["strength"] = {e.name: strength_of(e, recipe, motions) for e in recipe.effects}
@@ -569,7 +572,7 @@ def strength_of(effect: Effect, recipe: Recipe, motions: Mapping[Plan, Array]) -
     for plan, u in motions.items():
         p = recipe.acting(plan)
         less = effect.removed(p)
-        change = (recorded(rig, p, plan, u) - unread(rig, less, plan)) / recipe.gauge.sigma
+        change = (recorded(rig, p, plan, u) - unread(rig, less, plan)) / recipe.gauge.louder(plan.loud).sigma
         followed = bool(np.isfinite(change).all())
         rms[plan.name] = round(float(np.sqrt(np.mean(change**2))), 6) if followed else None
         if not plan.holdout:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_banded
@@ -24,6 +24,10 @@ class Gauge:
     quantum: float = QUANTUM
     pink: float = 0.0
     spikes: int = 0
+
+    def louder(self, factor: float) -> Gauge:
+        """Return the gauge with so many times the noise."""
+        return replace(self, sigma=self.sigma * factor)
 
 
 def read_gauge(u: Array, gauge: Gauge, rng: np.random.Generator) -> Array:

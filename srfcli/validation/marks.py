@@ -268,7 +268,7 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
         tangent = np.column_stack([(x - base) / PARAMETER_STEP for x in moved])
         if not (np.isfinite(signal).all() and np.isfinite(tangent).all()):
             return None, None
-        whitened = white(np.column_stack([signal, tangent]), gauge)
+        whitened = white(np.column_stack([signal, tangent]), gauge.louder(plan.loud))
         signals.append(whitened[:, 0])
         tangents.append(whitened[:, 1:])
     signal, tangent = np.concatenate(signals), np.concatenate(tangents)

@@ -196,7 +196,7 @@ class Plan:
 
     `rise` is the time in s of a switched modulation's tanh, or a load step's; 0 for the usual ones. Samples within `gaps` (s, s)
     are missing. After a step of the drive all are kept for `dense` s, then one in SPARSE; 0 keeps all. Of samples that come
-    unevenly, `wander` is the standard deviation of their times over the interval.
+    unevenly, `wander` is the standard deviation of their times over the interval. The gauge has `loud` times its usual noise.
     """
 
     name: str
@@ -212,6 +212,7 @@ class Plan:
     gaps: tuple[tuple[float, float], ...] = field(default=())
     dense: float = 0.0
     wander: float = 0.0
+    loud: float = 1.0
 
     @property
     def duration(self) -> float:

@@ -1,0 +1,140 @@
+"""Stick-slip alone: a sealed trial of it, and from how far its fits converge with a limit to what a reading may move.
+
+    python benchmarks/stick_slip.py FOLDER [--cases N] [--seed SEED] [--limits 3,inf,...] [--workers N]
+
+FOLDER becomes a sealed trial of the wide bank in which each run sticks and slips, about one case in thirty of that bank. Effects
+that act by a load that changes have none there; their cases are drawn anew. `search_steps.py FOLDER` with the same numbers
+answers it, and `srf prove --report-only FOLDER` marks it.
+
+With `--limits` the truths are read, and the right model of each case is fitted from the file's start values and from three
+others, A, B and D0 off by a quarter at random: the first steps of a fit, under one wide field after the other. Each limit takes
+the place of FARTHEST_UPDATE of `kalman.py`. Reached is what ends within NEAR of the likeliest maximum that any of these finds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import common  # noqa: F401  before NumPy: it fixes the number of threads
+import numpy as np
+from at_the_truth import right_hypothesis
+from common import Report
+
+from srfcli.core.errors import SrfError
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.search import SEARCH_RTOL, ModelSearch
+from srfcli.inference import kalman
+from srfcli.inference.state_space import NOT_CONVERGED, SCORING_STEPS, Likelihood, maximise, wide_starts
+from srfcli.laws.registry import bundled_registry
+from srfcli.validation import apparatus, cases
+from srfcli.validation.cases import Asked, Recipe, unseal
+from srfcli.validation.trials import Trial, begin
+
+OFF = 0.25  # standard deviation of the logarithms of A, B and D0 in other starts
+STARTS = 4  # of each case, the file's among them
+NEAR = 10.0  # in log likelihood, as another field may stand beside white noise alone
+Reached = dict[str, list[tuple[float, float]]]
+
+
+def drawn(trial: Path, n: int, seed: int) -> Trial:
+    """Return the sealed trial of that folder, made of stick-slip alone if it is not there."""
+    any_protocol, shares = cases.draw_wide, dict(apparatus.PROTOCOLS)
+
+    def draw_stick_slip(rng: np.random.Generator, asked: Asked) -> Recipe:
+        for number in range(2000):
+            recipe = any_protocol(rng, asked if number < 100 else Asked())
+            if recipe.protocol == "stick-slip":
+                return recipe
+        raise AssertionError("no stick-slip is drawn")
+
+    setattr(cases, "draw_wide", draw_stick_slip)  # noqa: B010
+    apparatus.PROTOCOLS.update({name: 0.01 for name in shares if name != "stick-slip"})
+    try:
+        return begin(trial, cases=n, seed=seed, kinds=(), bank="wide", resume=True, workers=1)
+    finally:
+        setattr(cases, "draw_wide", any_protocol)  # noqa: B010
+        apparatus.PROTOCOLS.update(shares)
+
+
+def fitted(case: tuple[Path, dict[str, Any], tuple[str, ...]]) -> Reached | str:
+    """Return by limit what each start reaches in log likelihood, and its CPU; a reason where the right model cannot be made."""
+    folder, concealed, limits = case
+    registry = bundled_registry()
+    search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
+    try:
+        likelihood = Likelihood(right_hypothesis(search, concealed).problem(registry, search.experiment), rtol=SEARCH_RTOL)
+    except SrfError as error:
+        return str(error)
+    file, rng = likelihood.values(likelihood.start), np.random.default_rng(concealed["seed"])
+    starts = [{n: file[n] for n in likelihood.problem.names}]
+    for _ in range(STARTS - 1):
+        off = {n: float(np.exp(OFF * rng.standard_normal())) for n in ("A", "B", "D0") if n in file}
+        starts.append(starts[0] | {n: file[n] * factor for n, factor in off.items()})
+    found: Reached = {}
+    for limit in limits:
+        setattr(kalman, "FARTHEST_UPDATE", float(limit))  # noqa: B010
+        found[limit] = [_reached(likelihood, start) for start in starts]
+    return found
+
+
+def _reached(likelihood: Likelihood, start: dict[str, float]) -> tuple[float, float]:
+    since, highest, at = time.process_time(), -np.inf, likelihood.names.index("field_amplitude")
+    for x in wide_starts(likelihood, start, lambda text: None):
+        best = maximise(likelihood, x, steps=SCORING_STEPS // 2, close=1.0)
+        highest = max(highest, best.point.log_likelihood)
+        if best.away < NOT_CONVERGED and best.point.x[at] < x[at]:
+            break
+    return highest, time.process_time() - since
+
+
+def _cases(trial: Trial, limits: tuple[str, ...]) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...]]]:
+    for case, concealed in sorted(unseal(trial.bank, trial.apart).items()):
+        if concealed["kind"] != "outside":
+            yield trial.bank / case, concealed, limits
+
+
+def main() -> None:
+    """Draw the trial; with limits, print how many starts of the right models reach the likeliest maximum under each."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--cases", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--limits", default="")
+    parser.add_argument("--workers", type=int, default=1)
+    given = parser.parse_args()
+    trial = drawn(given.folder, given.cases, given.seed)
+    print(f"SHA-256 of the sealed truths: {trial.digest()}", flush=True)
+    limits = tuple(given.limits.split(",")) if given.limits else ()
+    if not limits:
+        return
+    report = Report("stick_slip", __doc__ or "")
+    every: list[Reached] = []
+    known = list(_cases(trial, limits))
+    with ProcessPoolExecutor(given.workers) as pool:
+        for (folder, concealed, _), found in zip(known, pool.map(fitted, known), strict=True):
+            if isinstance(found, str):
+                continue
+            every.append(found)
+            heights = {limit: [round(height, 1) for height, _ in some] for limit, some in found.items()}
+            print(f"{folder.name}: {concealed['rig']}, {'+'.join(concealed['effects']) or 'none'}: {heights}", flush=True)
+    tops = [max(height for some in found.values() for height, _ in some) for found in every]
+    report.say(f"stick-slip of seed {given.seed}, digest {trial.digest()}: {len(every)} right models, {STARTS} starts of each\n")
+    rows = []
+    for limit in limits:
+        near = [[height > top - NEAR for height, _ in found[limit]] for found, top in zip(every, tops, strict=True)]
+        cpu = [cpu for found in every for _, cpu in found[limit]]
+        rows.append((
+            limit, str(sum(some[0] for some in near)), f"{100 * np.mean(near):.0f} %", str(sum(any(some) for some in near)),
+            str(sum(height == -np.inf for found in every for height, _ in found[limit])), f"{np.mean(cpu):.1f} s",
+        ))  # fmt: skip
+    header = ("a reading moves by", "reached from the file", "from all", "models reached", "cannot be followed", "CPU a fit")
+    report.table(header, rows)
+
+
+if __name__ == "__main__":
+    main()
