@@ -44,7 +44,7 @@ WAVES = {  # phases: the field, and by how much a sine leads the truth's cosine
     "drive-ripple": ("ripple_phase", math.pi / 2),
 }  # fmt: skip
 MISSED, LESS, UNTOLD = "missed by the search", "less likely than another", "not told by the recordings"
-PROCESSES = {"white": (), "uneven": (), "gaps": (), "spikes": (), "1/f": ("relaxation", "relaxation")}
+PROCESSES = {"white": (), "one run louder": (), "uneven": (), "gaps": (), "spikes": (), "1/f": ("relaxation", "relaxation")}
 
 
 def of_an_effect(effect: Effect, truth: Any) -> dict[str, float]:

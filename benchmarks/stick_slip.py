@@ -7,8 +7,9 @@ that act by a load that changes have none there; their cases are drawn anew. `se
 answers it, and `srf prove --report-only FOLDER` marks it.
 
 With `--limits` the truths are read, and the right model of each case is fitted from the file's start values and from three
-others, A, B and D0 off by a quarter at random: the first steps of a fit, under one wide field after the other. Each limit takes
-the place of FARTHEST_UPDATE of `kalman.py`. Reached is what ends within NEAR of the likeliest maximum that any of these finds.
+others, A, B and D0 off by a quarter at random: the first steps of a fit, under one wide field after the other, as a fit chooses
+them. Each limit takes the place of FARTHEST_UPDATE of `kalman.py`, inf is none. Reached is what ends within NEAR of the likeliest
+maximum that any of these finds.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ def fitted(case: tuple[Path, dict[str, Any], tuple[str, ...]]) -> Reached | str:
         starts.append(starts[0] | {n: file[n] * factor for n, factor in off.items()})
     found: Reached = {}
     for limit in limits:
-        setattr(kalman, "FARTHEST_UPDATE", float(limit))  # noqa: B010
+        setattr(kalman, "FARTHEST_UPDATE", min(float(limit), 1e12))  # noqa: B010
         found[limit] = [_reached(likelihood, start) for start in starts]
     return found
 
@@ -87,7 +88,7 @@ def _reached(likelihood: Likelihood, start: dict[str, float]) -> tuple[float, fl
     for x in wide_starts(likelihood, start, lambda text: None):
         best = maximise(likelihood, x, steps=SCORING_STEPS // 2, close=1.0)
         highest = max(highest, best.point.log_likelihood)
-        if best.away < NOT_CONVERGED and best.point.x[at] < x[at]:
+        if best.away < NOT_CONVERGED and best.point.x[at] < x[at] and not best.point.surprising:
             break
     return highest, time.process_time() - since
 

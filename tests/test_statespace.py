@@ -181,18 +181,27 @@ def test_a_reading_moves_logarithms_and_field_no_farther_than_is_linear(make_mod
         return filter_run(model, fallen.experiment, fallen.run, values | changed, by=by, rtol=1e-8, keep=keep)
 
     by = ("A", "B", "D0", "field_amplitude")
-    exact = filtered({}, by)
-    assert exact.whole
-    kept = filtered({}, keep=True).found.kept
-    fall = int(np.argmax(fallen.run.t >= 0.3))
-    moved = kept.covariance[fall] @ kept.gradient[fall] / exact.found.S[fall] * exact.found.nu[fall]
-    states = list(model.states)
-    assert abs(moved[states.index("ln_v")]) > 4.0 and abs(moved[states.index("field")]) > 5.0 * FIELD["field_amplitude"]
+    exact, found = filtered({}, by).found, filtered({}, keep=True).found
+    kept, fall, states = found.kept, int(np.argmax(fallen.run.t >= 0.3)), list(model.states)
+    assert exact.reached == fallen.run.t.size and 0 < exact.bounded < fallen.run.t.size
+    t, shown = (np.insert(a, fall, a[fall]) for a in (fallen.run.t, fallen.run.observed))
+    twice = recording(t, "elongation", STEPS, ConstantLoad(5.0), observed=shown)
+    again = filter_run(model, fallen.experiment, twice, values, rtol=1e-8, keep=True).found.kept
+    free = kept.covariance[fall] @ kept.gradient[fall] / found.S[fall]  # the gain that leaves the least variance
+    for name, most in (("ln_v", 3.0), ("field", 3.0 * FIELD["field_amplitude"])):
+        i = states.index(name)
+        assert abs(free[i] * found.nu[fall]) > 1.3 * most and kept.gain[fall, i] == 0
+        moved = again.mean[fall + 1, i] - kept.mean[fall, i]  # the same reading once more, before it is used
+        assert moved == pytest.approx(np.copysign(most, free[i] * found.nu[fall]))
+    u = states.index("u")
+    assert kept.gain[fall, u] == pytest.approx(free[u])
+    before = fall - 1
+    assert np.allclose(kept.gain[before], kept.covariance[before] @ kept.gradient[before] / found.S[before])
     for j, name in enumerate(by):
         step = 1e-5 * values[name]
-        sides = [filtered({name: values[name] + sign * step}).found.nu for sign in (1, -1)]
-        nu_d = (sides[0] - sides[1]) / (2 * step)
-        assert np.abs(exact.found.nu_d[:, j] - nu_d).max() < 1e-3 * np.abs(nu_d).max(), name
+        sides = [filtered({name: values[name] + sign * step}).found for sign in (1, -1)]
+        for ours, theirs in ((exact.nu_d, sides[0].nu - sides[1].nu), (exact.S_d, sides[0].S - sides[1].S)):
+            assert np.abs(ours[:, j] - theirs / (2 * step)).max() < 1e-3 * np.abs(theirs / (2 * step)).max(), name
 
 
 def test_derivatives_of_every_function_that_a_law_may_have(tmp_path, make_model):

@@ -422,21 +422,21 @@ static void fresh_gauge(Course *course, Belief *b, const dual *gauge) {
 
 /* One run: innovations nu (nt), their variances S (nt) and the derivatives of both (nt, LANES), at the readings where `used`; all
    get the mean (nt, na), covariance (nt, na, na), transition (nt, na, na) from the reading before and the reading's gradient
-   (nt, na), before they are used, where those are wanted (`keep`). Several signals may be read at one time: `t` (nt) does not fall,
+   (nt, na), before they are used, and how states follow it (nt, na), 0 if held, where those are wanted. Several signals may be read at one time: `t` (nt) does not fall,
    and `signal` (nt) says which it is. A reading is `factor` times what it `shows` (nt) plus offset plus gauge noise of variance R:
    GAUGE the elongation as the gauge has it, SPRING as it is, where spring weighs by `weighs` (nt), 0 or 1, with which parameter
    `weighed` is replaced (-1 for none); from 0 on a state. The processes of coloured noise have `order` (ng) states each, belong to
    the signal `owner` (ng), and have parameters gauge (rates, ng, 3); which of the rates holds at a reading is `rate` (nt): where it
    changes, a noise begins that owes nothing to the one before. A reading moves no state by more than `farthest` (NX). p holds dual
    numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset, R (nt) and farthest. Returns how many readings were reached; stats: steps,
-   rejected. */
-int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, const double *farthest, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
+   rejected, readings that were held to `farthest`. */
+int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, const double *farthest, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *gains, double *stats, const volatile int *stop) {
     double values[NP];
     dual q[NP], colour[3 * GAUGE_PROCESSES * SIGNALS], y[NX], one, g[NX], bound[NX];
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values};
     Course course = {values, q, slopes, keep, ng, NX, order, rtol, 0.0, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
     Belief b;
-    int na, segment_ = -1, filled = 0, begins[NA] = {0}; /* 1 + the signal of the process whose first state this is */
+    int na, segment_ = -1, filled = 0, bounded = 0, begins[NA] = {0}; /* 1 + the signal of the process whose first state this is */
     double now = t[0], last = t[0];
     const size_t wide = 1 + LANES;
 #define TAKE(to, from) ((to).v = *(from), memcpy(&(to).d, (from) + 1, sizeof(lanes)))
@@ -530,6 +530,7 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
         if (keep) {
             memcpy(mean + (size_t)k * na, b.x, na * sizeof(double));
             memcpy(gradient + (size_t)k * na, H, na * sizeof(double));
+            memset(gains + (size_t)k * na, 0, na * sizeof(double));
             memcpy(covariance + (size_t)k * na * na, b.P, (size_t)na * na * sizeof(double));
             memcpy(transition + (size_t)k * na * na, b.T, (size_t)na * na * sizeof(double));
         }
@@ -537,26 +538,29 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
         memset(b.T, 0, (size_t)na * na * sizeof(double));
         for (int i = 0; i < na; i++) b.T[i * na + i] = 1.0;
         if (!used[k] || !(variance > 0.0)) continue;
+        int far = 0;
         for (int i = 0; i < na; i++) {
-            double gain = PH[i] / variance;
-            lanes dgain = (dPH[i] - gain * dvariance) / variance;
+            double gain = PH[i] / variance, move = gain * miss;
+            lanes dgain = (dPH[i] - gain * dvariance) / variance, dmove = dgain * miss + gain * dmiss;
+            int held = i < NX && fabs(move) > bound[i].v; /* the equations are not linear so far */
             if (slopes) {
                 for (int j = 0; j < na; j++) add_scaled(LANES, -PH[j], &dgain, b.Pd + i * na + j);
                 add_scaled(na * LANES, -gain, dPH, b.Pd + i * na);
             }
             for (int j = 0; j < na; j++) b.P[i * na + j] -= gain * PH[j];
-            double move = gain * miss;
-            lanes dmove = dgain * miss + gain * dmiss;
-            if (i < NX && fabs(move) > bound[i].v) { /* the equations are not linear so far */
+            if (held) {
                 dmove = move < 0.0 ? -bound[i].d : bound[i].d;
                 move = copysign(bound[i].v, move);
-            }
+                far = 1;
+            } else if (keep) gains[(size_t)k * na + i] = gain;
             b.xd[i] += dmove;
             b.x[i] += move;
         }
+        bounded += far;
     }
 end:
     stats[0] = course.steps;
     stats[1] = course.rejected;
+    stats[2] = bounded;
     return filled;
 }

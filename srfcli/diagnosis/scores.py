@@ -21,7 +21,6 @@ from srfcli.core.units import to_base
 from srfcli.data.values import Experiment, Run, per_elongation
 from srfcli.diagnosis.hypotheses import Excluded, Shape, along_table, inner_grid, neutral_values, own_parameters
 from srfcli.inference.critical_loads import TableLikelihood, apparatus
-from srfcli.inference.kalman import gains
 from srfcli.inference.prediction import own_names, own_start, run_parameters
 from srfcli.inference.recordings import slip_along
 from srfcli.inference.shared_field import FieldPrior
@@ -538,7 +537,7 @@ def _carried(
             if by_V is None:
                 by_V = _rates_by_V(model, fitted, run, kept.mean[:, : len(states)])
             inputs[1:, : len(states), j] = 0.5 * (by_V[1:] + by_V[:-1]) * total[:, None]
-    lost = np.einsum("kij,kj->ki", known.transition[1:], gains(every, f.taken)[:-1])  # of what a reading shows, by the next one
+    lost = np.einsum("kij,kj->ki", known.transition[1:], known.gain[:-1])  # of what a reading shows, by the next one
     through = known.transition.copy()
     through[1:] -= lost[:, :, None] * known.gradient[:-1, None, :]
     if late:  # a delay is that of the first signal's gauge

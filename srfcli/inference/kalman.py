@@ -19,7 +19,7 @@ from srfcli.core.errors import SrfError
 from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.integrators import doubles, imposed_arguments, interruptible, rtol_of_estimate
 
-FARTHEST_UPDATE = 3.0  # of what is linear: ln v and ln PHI by a factor of 20, the field by three of its standard deviations
+FARTHEST_UPDATE = 3.0  # of ln v and ln PHI, a factor of 20 in v and PHI; standard deviations of the field
 STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
 
 GAUGE, SPRING = -1, -2  # what a reading shows: the elongation as the gauge has it, or as it is; from 0 on a state
@@ -72,18 +72,23 @@ class Signals:
 class Kept:
     """What the smoother needs, before each reading is used: mean (n, a), covariance, transition since the one before (n, a, a).
 
-    a is the number of states with those of the gauge noise after them; `gradient` (n, a) is that of the reading.
+    a is the number of states with those of the gauge noise after them; `gradient` (n, a) is that of the reading, `gain` (n, a)
+    by how much the states follow its innovation, zero where it is not used and where they are held.
     """
 
     mean: Array
     covariance: Array
     transition: Array
     gradient: Array
+    gain: Array
 
 
 @dataclass(frozen=True)
 class Innovations:
-    """Innovations `nu` (n,), their variances `S` (n,), and the derivatives of both (n, k); NaN after `reached` readings."""
+    """Innovations `nu` (n,), their variances `S` (n,), and the derivatives of both (n, k); NaN after `reached` readings.
+
+    `bounded` readings would have moved the state by more than FARTHEST_UPDATE.
+    """
 
     nu: Array
     S: Array
@@ -91,6 +96,7 @@ class Innovations:
     S_d: Array
     reached: int
     steps: int
+    bounded: int
     kept: Kept | None
 
 
@@ -145,9 +151,9 @@ def kalman_filter(
     number, shows = (np.ascontiguousarray(a, dtype=np.intc) for a in (signals.number, signals.shows))
     nu, S = np.full(n, np.nan), np.full(n, np.nan)
     nu_d, S_d = np.full((n, k), np.nan), np.full((n, k), np.nan)
-    shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide)) if keep else ((1,),) * 4
+    shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide), (n, wide)) if keep else ((1,),) * 5
     arrays = [np.full(shape, np.nan) for shape in shapes]
-    stats, stop, reached = np.zeros(2), ctypes.c_int(0), n
+    stats, stop, reached = np.zeros(3), ctypes.c_int(0), n
     imposed, use = imposed_arguments(t, drive, load), np.ascontiguousarray(used, dtype=np.uint8)
     size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000) if most is None else most
     allowed, farthest = np.asarray(atol) * size / rtol, _farthest(model, p)
@@ -169,15 +175,16 @@ def kalman_filter(
         count = min(LANES, k - first)
         nu_d[:, first : first + count], S_d[:, first : first + count] = own_nu[:, :count], own_S[:, :count]
     kept = Kept(*arrays) if keep else None
-    return Innovations(nu, S, nu_d, S_d, reached, int(stats[0]), kept)
+    return Innovations(nu, S, nu_d, S_d, reached, int(stats[0]), int(stats[2]), kept)
 
 
 def _farthest(model: GeneratedModel, p: Dual) -> Dual:
     """Return by how much a reading may move each state (n,), without end but for logarithms and the field."""
     amplitude = model.index("field_amplitude")
-    random = np.array([s.startswith("field") for s in model.states])
-    unit = np.where(random, p.v[amplitude], [1.0 if s.startswith("ln_") else np.inf for s in model.states])
-    return Dual(FARTHEST_UPDATE * unit, FARTHEST_UPDATE * np.outer(random, p.d[amplitude]))
+    random = np.isin(model.states, ("field", "field_slope"))
+    bounded = random | np.array([s.startswith("ln_") for s in model.states])
+    unit = np.where(random, p.v[amplitude], 1.0)
+    return Dual(np.where(bounded, FARTHEST_UPDATE * unit, np.inf), FARTHEST_UPDATE * np.outer(random, p.d[amplitude]))
 
 
 @dataclass(frozen=True)
@@ -194,18 +201,11 @@ class Smoothed:
     N: Array
 
 
-def gains(found: Innovations, used: NDArray[np.bool_]) -> Array:
-    """Return by how much the states expected follow each innovation (n, a), zero where a reading is not used."""
+def smooth(found: Innovations, used: NDArray[np.bool_]) -> Smoothed:
+    """Return the fixed-interval smoother of what the filter kept."""
     kept = found.kept
     if kept is None:
         raise SrfError("the filter kept nothing to smooth", "kalman_filter(..., keep=True)")
-    return np.where(used, 1 / found.S, 0.0)[:, None] * np.einsum("kij,kj->ki", kept.covariance, kept.gradient)
-
-
-def smooth(found: Innovations, used: NDArray[np.bool_]) -> Smoothed:
-    """Return the fixed-interval smoother of what the filter kept."""
-    gain, kept = gains(found, used), found.kept
-    assert kept is not None
     n, a = kept.mean.shape
     r, N = np.zeros(a), np.zeros((a, a))
     mean, P = kept.mean.copy(), kept.covariance.copy()
@@ -213,7 +213,7 @@ def smooth(found: Innovations, used: NDArray[np.bool_]) -> Smoothed:
     for k in range(n - 1, -1, -1):
         if used[k] and k < found.reached:
             H, S = kept.gradient[k], found.S[k]
-            through = np.eye(a) - np.outer(gain[k], H)
+            through = np.eye(a) - np.outer(kept.gain[k], H)
             r = H * (found.nu[k] / S) + through.T @ r
             N = np.outer(H, H) / S + through.T @ N @ through
         scores[k], information[k] = r, N

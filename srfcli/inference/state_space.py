@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import product
 from typing import Any, TypeAlias, TypeVar
@@ -55,8 +55,6 @@ FIELD = ("field_amplitude", "field_length")
 # while none leads near a maximum under a field that is narrower than it was
 WIDE = ((0.01, 3.0), (0.01, 10.0), (0.003, 1.0), (0.3, 1.0))
 SHORT = (1.0, 0.25, 0.06)  # lengths of faint fields that are tried, over the same
-TOO_LOUD = 3.0  # times the noise that a recording itself shows: more is left by a maximum that misses the falls of stick-slip
-QUIETER = 30.0  # times less noise than a recording itself shows, that it may have
 NOT_CONVERGED = 3.0  # standard errors from its maximum at which a fit is none
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
 LEAST_FIELD = 1e-6  # the least amplitude of a field, over the friction of the recordings
@@ -77,6 +75,7 @@ WIDEST_ERRORS = 1000.0  # times that width, in standard errors: what readings te
 WEIGHT_ROUNDS = 12  # of weights and standard errors, each from the other
 FAR_PROBE = 50.0  # standard errors of a parameter at which innovations move by less than derivatives want, if it oscillates
 PEAK = 12.0  # in log likelihood: the height of a narrow maximum from which it is looked for; of hundreds, chance makes one of 6
+SCANNED = 1000  # points of such a scan, at most: what is narrower is of one reading, and chance makes as high a peak of more
 SCAN_REACH = 0.36  # of a parameter, in its logarithm, to either side: start values are 30 % off
 PEAKS, PEAK_STEPS = 3, 3  # of a scan that are looked at closer, and the steps of scoring that the other parameters then have
 PROBE = 10.0  # standard errors along a ridge, at which the likelihood is asked for
@@ -118,8 +117,8 @@ class Filtered:
     def of(self, signal: int) -> Innovations:
         """Return innovations (n,), variances and derivatives of one signal, and what was kept where its readings are."""
         f, k, c = self.every, len(self.run.signals), slice(signal, None, len(self.run.signals))
-        kept = f.kept and Kept(f.kept.mean[c], f.kept.covariance[c], f.kept.transition[c], f.kept.gradient[c])
-        return Innovations(f.nu[c], f.S[c], f.nu_d[c], f.S_d[c], (f.reached + k - 1 - signal) // k, f.steps, kept)
+        kept = f.kept and Kept(*(getattr(f.kept, own.name)[c] for own in fields(f.kept)))
+        return Innovations(f.nu[c], f.S[c], f.nu_d[c], f.S_d[c], (f.reached + k - 1 - signal) // k, f.steps, f.bounded, kept)
 
     @cached_property
     def found(self) -> Innovations:
@@ -403,6 +402,11 @@ class Point:
         white = np.concatenate([f.white for f in self.runs] + [t.white for t in self.tables])
         return float(np.sqrt(np.mean(white**2)))
 
+    @property
+    def surprising(self) -> int:
+        """Return how many readings would move the state farther than is linear; none where the model expects what it sees."""
+        return sum(f.every.bounded for f in self.runs)
+
 
 class Likelihood:
     """The log likelihood of a problem's runs, whose model has a random friction field, and of its tables of critical loads.
@@ -684,7 +688,7 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
         level = float(np.median([first_level(*each) for each in own]))
         quiet = min([level, *(max(_floor(*each), 1e-3 * level) for each in own)])
         found |= {
-            ("gauge_white", what): (level, quiet / QUIETER, 100 * level),
+            ("gauge_white", what): (level, quiet / 30, 100 * level),
             ("gauge_colour", what): (level, quiet / 100, 100 * level),
             ("gauge_time", what): (10 * spacing, spacing, longest),
             ("gauge_frequency", what): (0.1 / spacing, 1 / longest, FASTEST_OSCILLATION / spacing),
@@ -1241,17 +1245,16 @@ def _fitted(
         """Return the maximum from the first start that leads near one, or the likeliest that was reached from all.
 
         Under a field that is no narrower than the start's the filter follows the recordings whatever the parameters are: these
-        may have drifted to where no step leads back, and another start is tried. So it is where TOO_LOUD times the noise of the
-        recordings themselves is left.
+        may have drifted to where no step leads back, and another start is tried. So it is where a reading moves the state farther
+        than is linear: the falls of stick-slip come as a surprise there.
         """
         found: Maximum | None = None
-        at, white = wide.names.index("field_amplitude"), np.array([n.startswith("gauge_white") for n in wide.names])
-        loud = np.where(white, wide.lower + np.log(TOO_LOUD * QUIETER), np.inf)
+        at = wide.names.index("field_amplitude")
         for x in starts:
             other = maximise(wide, x, steps=SCORING_STEPS // 2 if fresh else 12, close=1.0, progress=progress)
             if found is None or other.point.log_likelihood > found.point.log_likelihood:
                 found = other
-            if other.away < NOT_CONVERGED and other.point.x[at] < x[at] and (other.point.x < loud).all():
+            if other.away < NOT_CONVERGED and other.point.x[at] < x[at] and not other.point.surprising:
                 break
         return found
 
@@ -1297,6 +1300,13 @@ def _fitted(
             if other.criterion > best.criterion:  # beside the colour there may be another, smaller field
                 best = _beside_small_field(other, likelihood)
                 best = best if best.smooth else _with_or_without(best, smooth, likelihood, close, progress)
+    if fresh and processes is None and best.maximum.point.surprising:  # a wide field stood for colour, and for the falls too
+        known = best.likelihood.processes or ("relaxation",)
+        other = _fitted(
+            likelihood, start, smooth=smooth, processes=known, cautious=cautious, thorough=thorough, beside=False, least=least,
+            close=close, progress=progress,
+        )  # fmt: skip
+        best = max(best, other, key=lambda f: f.criterion)
     if fresh:
         best = likeliest_beside(best, close, progress) if beside else best
     if fresh and smooth is None and best.smooth:
@@ -1420,6 +1430,8 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
         run, half = narrow
         reach, name = SCAN_REACH * _size(likelihood, point, j), likelihood.names[j]
         low, high = max(point.x[j] - reach, likelihood.lower[j]), min(point.x[j] + reach, likelihood.upper[j])
+        if (high - low) / half > SCANNED:
+            continue
         points = np.tile(point.x, (int((high - low) / half) + 2, 1))
         points[:, j] = np.linspace(low, high, len(points))
         here = likelihood.filtered(run, point.values)

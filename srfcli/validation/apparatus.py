@@ -472,7 +472,7 @@ def disturbed(rng: np.random.Generator, plans: Sequence[Plan], noise: str) -> tu
     No gap falls where the load changes, as nobody would know how; a recorder is slowed down where the load is constant.
     """
     fitted, out = [plan.name for plan in plans if not plan.holdout], []
-    loud = str(rng.choice(fitted)) if noise == "one run louder" else ""
+    loud = str(rng.choice(fitted)) if noise == "one run louder" and len(fitted) > 1 else ""
     for plan in plans:
         if plan.name == loud:
             plan = replace(plan, loud=float(f"{np.exp(rng.uniform(*np.log(LOUDER))):.3g}"))
