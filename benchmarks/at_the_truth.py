@@ -25,6 +25,7 @@ from common import Report
 
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
+from srfcli.data.groups import GAUGE_NOISE
 from srfcli.diagnosis.hypotheses import Hypothesis, own_parameters
 from srfcli.diagnosis.search import CLOSE, NEAR, ModelSearch
 from srfcli.inference.state_space import Likelihood, StateSpaceFit, maximise
@@ -85,7 +86,9 @@ def fitted(folder: Path, concealed: dict[str, Any]) -> tuple[str, float, float, 
     registry, truth = bundled_registry(), known_physics(concealed)
     search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
     hypothesis = right_hypothesis(search, concealed)
-    problem = hypothesis.problem(registry, search.experiment)
+    louder = concealed["noise"] == "one run louder"
+    own = replace(search.experiment, vary=(GAUGE_NOISE,), by="run") if louder else search.experiment
+    problem = hypothesis.problem(registry, own)
     likelihood = Likelihood(problem, processes=PROCESSES.get(concealed["noise"], ("relaxation",)), rtol=RTOL)
     values, stated = likelihood.values(likelihood.start), known_physics(concealed, baseline=True)
     values |= {n: float(getattr(stated, LAWS[n])) for n in problem.names if n in LAWS and getattr(stated, LAWS[n])}

@@ -1241,12 +1241,11 @@ def _fitted(
     wide = likelihood(False, processes or ())
     fresh = "field_amplitude" not in start
 
-    def from_any(starts: Iterable[Array]) -> Maximum | None:
+    def from_any(starts: Iterable[Array], wide: Likelihood = wide) -> Maximum | None:
         """Return the maximum from the first start that leads near one, or the likeliest that was reached from all.
 
         Under a field that is no narrower than the start's the filter follows the recordings whatever the parameters are: these
-        may have drifted to where no step leads back, and another start is tried. So it is where a reading moves the state farther
-        than is linear: the falls of stick-slip come as a surprise there.
+        may have drifted to where no step leads back, and another start is tried.
         """
         found: Maximum | None = None
         at = wide.names.index("field_amplitude")
@@ -1254,7 +1253,7 @@ def _fitted(
             other = maximise(wide, x, steps=SCORING_STEPS // 2 if fresh else 12, close=1.0, progress=progress)
             if found is None or other.point.log_likelihood > found.point.log_likelihood:
                 found = other
-            if other.away < NOT_CONVERGED and other.point.x[at] < x[at] and not other.point.surprising:
+            if other.away < NOT_CONVERGED and other.point.x[at] < x[at]:
                 break
         return found
 
@@ -1300,13 +1299,13 @@ def _fitted(
             if other.criterion > best.criterion:  # beside the colour there may be another, smaller field
                 best = _beside_small_field(other, likelihood)
                 best = best if best.smooth else _with_or_without(best, smooth, likelihood, close, progress)
-    if fresh and processes is None and best.maximum.point.surprising:  # a wide field stood for colour, and for the falls too
-        known = best.likelihood.processes or ("relaxation",)
-        other = _fitted(
-            likelihood, start, smooth=smooth, processes=known, cautious=cautious, thorough=thorough, beside=False, least=least,
-            close=close, progress=progress,
-        )  # fmt: skip
-        best = max(best, other, key=lambda f: f.criterion)
+    widest = wide.values(wide.start)["field_amplitude"]  # which may stand for colour, and for falls that come as a surprise
+    if fresh and processes is None and best.maximum.point.surprising and best.values["field_amplitude"] > widest:
+        coloured = likelihood(False, best.likelihood.processes or ("relaxation",))
+        another = from_any(wide_starts(coloured, start, progress), coloured)
+        if another and another.promised > best.log_likelihood:
+            other = StateSpaceFit(coloured, maximise(coloured, another.point.x, close=close, progress=progress))
+            best = max(best, _with_or_without(other, smooth, likelihood, close, progress), key=lambda f: f.criterion)
     if fresh:
         best = likeliest_beside(best, close, progress) if beside else best
     if fresh and smooth is None and best.smooth:
