@@ -8,7 +8,7 @@ answers it, and `srf prove --report-only FOLDER` marks it.
 
 With `--limits` the truths are read, and the right model of each case is fitted from the file's start values and from others, A,
 B and D0 off by a quarter at random: the first steps of a fit, under one wide field after the other, as a fit chooses them. Each
-limit takes the place of FARTHEST_UPDATE of `kalman.py`, inf is none. Reached is what ends within NEAR of the likeliest maximum
+limit takes the place of FARTHEST_UPDATE, inf is none. Reached is what ends within NEAR of the likeliest maximum
 that any of these finds.
 """
 
@@ -29,7 +29,7 @@ from common import Report
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis.search import SEARCH_RTOL, ModelSearch
-from srfcli.inference import kalman
+from srfcli.inference import state_space
 from srfcli.inference.state_space import NOT_CONVERGED, SCORING_STEPS, Likelihood, maximise, wide_starts
 from srfcli.laws.registry import bundled_registry
 from srfcli.validation import apparatus, cases
@@ -78,7 +78,7 @@ def fitted(case: tuple[Path, dict[str, Any], tuple[str, ...]]) -> Reached | str:
         starts.append(starts[0] | {n: file[n] * factor for n, factor in off.items()})
     found: Reached = {}
     for limit in limits:
-        setattr(kalman, "FARTHEST_UPDATE", min(float(limit), 1e12))  # noqa: B010
+        setattr(state_space, "FARTHEST_UPDATE", min(float(limit), 1e12))  # noqa: B010
         found[limit] = [_reached(likelihood, start) for start in starts]
     return found
 

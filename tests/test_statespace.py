@@ -178,7 +178,7 @@ def test_a_reading_moves_logarithms_and_field_no_farther_than_is_linear(make_mod
     values = own.values | FIELD | {"gauge_white": 0.01}
 
     def filtered(changed: dict[str, float], by: tuple[str, ...] = (), keep: bool = False) -> Any:
-        return filter_run(model, fallen.experiment, fallen.run, values | changed, by=by, rtol=1e-8, keep=keep)
+        return filter_run(model, fallen.experiment, fallen.run, values | changed, by=by, rtol=1e-8, keep=keep, farthest=3.0)
 
     by = ("A", "B", "D0", "field_amplitude")
     exact, found = filtered({}, by).found, filtered({}, keep=True).found
@@ -186,7 +186,7 @@ def test_a_reading_moves_logarithms_and_field_no_farther_than_is_linear(make_mod
     assert exact.reached == fallen.run.t.size and 0 < exact.bounded < fallen.run.t.size
     t, shown = (np.insert(a, fall, a[fall]) for a in (fallen.run.t, fallen.run.observed))
     twice = recording(t, "elongation", STEPS, ConstantLoad(5.0), observed=shown)
-    again = filter_run(model, fallen.experiment, twice, values, rtol=1e-8, keep=True).found.kept
+    again = filter_run(model, fallen.experiment, twice, values, rtol=1e-8, keep=True, farthest=3.0).found.kept
     free = kept.covariance[fall] @ kept.gradient[fall] / found.S[fall]  # the gain that leaves the least variance
     for name, most in (("ln_v", 3.0), ("field", 3.0 * FIELD["field_amplitude"])):
         i = states.index(name)

@@ -87,7 +87,7 @@ class Kept:
 class Innovations:
     """Innovations `nu` (n,), their variances `S` (n,), and the derivatives of both (n, k); NaN after `reached` readings.
 
-    `bounded` readings would have moved the state by more than FARTHEST_UPDATE.
+    `bounded` readings would have moved the state farther than they may.
     """
 
     nu: Array
@@ -122,6 +122,7 @@ def kalman_filter(
     atol: Array,
     keep: bool = False,
     most: int | None = None,
+    farthest: float = np.inf,
 ) -> Innovations:
     """Return the innovations of the readings `observed` (n,) at times `t` (s) that do not fall; those `used` are taken up.
 
@@ -131,8 +132,9 @@ def kalman_filter(
     quality q and standard deviation s, (f, s, q). `rate` (n,) says which row holds at a sample, the first if left out; where it
     changes, a new noise begins.
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
-    numbers in the same k directions. A reading moves ln v, ln PHI and the field by no more than FARTHEST_UPDATE, as what it says
-    of them is linear: beside the fall of a stick-slip cycle that would be a velocity of any size, which cannot be followed. Each
+    numbers in the same k directions. A reading moves ln v and ln PHI by no more than `farthest`, and the field by as many of its
+    standard deviations, as what it says of them is linear: beside the fall of a stick-slip cycle that may be a velocity of any
+    size, which cannot be followed. Each
     reading is still predicted from those before it alone, so that the likelihood is one. After `most` steps, 50 a sample if left
     out, the rest is NaN. Raises SrfError without a compiler, or for a model without a random friction field.
     """
@@ -156,7 +158,7 @@ def kalman_filter(
     stats, stop, reached = np.zeros(3), ctypes.c_int(0), n
     imposed, use = imposed_arguments(t, drive, load), np.ascontiguousarray(used, dtype=np.uint8)
     size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000) if most is None else most
-    allowed, farthest = np.asarray(atol) * size / rtol, _farthest(model, p)
+    allowed, bounds = np.asarray(atol) * size / rtol, _bounds(model, p, farthest)
     for first in range(0, max(k, 1), LANES):
         own_nu, own_S = np.full((n, LANES), np.nan), np.full((n, LANES), np.nan)
         keeping = keep and first == 0
@@ -168,7 +170,7 @@ def kalman_filter(
             int(k > 0), ctypes.c_double(size), doubles(allowed),
             ctypes.c_long(most), n,
             doubles(t), doubles(observed), ctypes.c_void_p(use.ctypes.data), doubles(factor.packed(first)),
-            doubles(offset.packed(first)), doubles(R.packed(first)), doubles(farthest.packed(first)), int(keeping), doubles(nu),
+            doubles(offset.packed(first)), doubles(R.packed(first)), doubles(bounds.packed(first)), int(keeping), doubles(nu),
             doubles(S), doubles(own_nu), doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),
         )  # fmt: skip
         reached = min(reached, interruptible(lambda arguments=arguments: library.srf_filter(*arguments), stop))  # type: ignore[misc]
@@ -178,13 +180,14 @@ def kalman_filter(
     return Innovations(nu, S, nu_d, S_d, reached, int(stats[0]), int(stats[2]), kept)
 
 
-def _farthest(model: GeneratedModel, p: Dual) -> Dual:
+def _bounds(model: GeneratedModel, p: Dual, farthest: float) -> Dual:
     """Return by how much a reading may move each state (n,), without end but for logarithms and the field."""
     amplitude = model.index("field_amplitude")
     random = np.isin(model.states, ("field", "field_slope"))
-    bounded = random | np.array([s.startswith("ln_") for s in model.states])
-    unit = np.where(random, p.v[amplitude], 1.0)
-    return Dual(np.where(bounded, FARTHEST_UPDATE * unit, np.inf), FARTHEST_UPDATE * np.outer(random, p.d[amplitude]))
+    bounded = np.isfinite(farthest) & (random | np.array([s.startswith("ln_") for s in model.states]))
+    size = farthest if np.isfinite(farthest) else 0.0
+    own = np.where(bounded, size * np.where(random, p.v[amplitude], 1.0), np.inf)
+    return Dual(own, size * np.outer(random & bounded, p.d[amplitude]))
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,18 @@ from srfcli.data.noise import calm_level, carried
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, inverse
-from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
+from srfcli.inference.kalman import (
+    FARTHEST_UPDATE,
+    GAUGE,
+    SPRING,
+    Dual,
+    Innovations,
+    Kept,
+    Signals,
+    Smoothed,
+    kalman_filter,
+    smooth,
+)
 from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
     TINY,
@@ -264,6 +275,7 @@ def filter_run(
     rtol: float = FILTER_RTOL,
     keep: bool = False,
     most: int | None = None,
+    farthest: float = np.inf,
 ) -> Filtered:
     """Return `run` filtered under `values` (um, s, N), with derivatives by the parameters `by`.
 
@@ -271,7 +283,8 @@ def filter_run(
     gauge noise in the observable's unit, `gauge_colour1` of a coloured part with `gauge_time1` (s) if its correlation falls off
     exponentially or `gauge_frequency1` (Hz) and `gauge_quality1` if it is an oscillator's, and so on up to 3 of these, and what
     belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. `gauges` say by which names they have those of the gauge: for each
-    signal, one after the other, one for each of the run's sampling rates. After `most` steps it is given up.
+    signal, one after the other, one for each of the run's sampling rates. After `most` steps it is given up. `farthest` is how
+    far a reading may move the state, as `kalman_filter` has it.
     """
     k, c, rates = len(by), len(run.signals), len(run.sampling.spacings)
     p = run_parameters(model, experiment, run, values)
@@ -297,7 +310,7 @@ def filter_run(
         model, Dual(p, d), drive=run.drive, load=run.load, t=read.t, observed=read.observed, used=read.used, start=start,
         covariance=P0, gauge=Dual(gauge[0].reshape(rates, -1, 3), gauge[1].reshape(rates, c * len(rows), 3, k)),
         order=[len(row) - 1 for row in rows] * c, rate=rate, signals=read.signals, factor=read.factor, offset=read.offset,
-        R=R, rtol=rtol, atol=rtol * size * fine, keep=keep, most=most,
+        R=R, rtol=rtol, atol=rtol * size * fine, keep=keep, most=most, farthest=farthest,
     )  # fmt: skip
     return Filtered(run, tuple(by), found)
 
@@ -543,11 +556,14 @@ class Likelihood:
             for n in self.names
             if n in own or (n not in others and ("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
         }
-        found = filter_run(
-            problem.model, problem.experiment, run, problem.local(run, values), by=tuple(by.values()) if slopes else (),
-            gauges=gauges,
-            trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
-        )  # fmt: skip
+        for farthest in (np.inf, FARTHEST_UPDATE):  # held back where it cannot be followed otherwise
+            found = filter_run(
+                problem.model, problem.experiment, run, problem.local(run, values), by=tuple(by.values()) if slopes else (),
+                gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
+                farthest=farthest,
+            )  # fmt: skip
+            if found.whole:
+                break
         return replace(found, names=tuple(by) if slopes else ())
 
     def held_out(self, run: Run, values: Mapping[str, float]) -> Filtered:
