@@ -28,6 +28,7 @@ from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import GAUGE_NOISE
 from srfcli.diagnosis.hypotheses import Hypothesis, own_parameters
 from srfcli.diagnosis.search import CLOSE, NEAR, ModelSearch
+from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import Likelihood, StateSpaceFit, maximise
 from srfcli.laws.registry import bundled_registry
 from srfcli.laws.values import Effect
@@ -81,14 +82,19 @@ def right_hypothesis(search: ModelSearch, concealed: dict[str, Any]) -> Hypothes
     return Hypothesis(tuple(candidate(search, n, truth, run) for n in concealed["effects"] if n not in laws), "".join(laws))
 
 
+def right_problem(folder: Path, concealed: dict[str, Any]) -> tuple[ModelSearch, Hypothesis, Problem]:
+    """Return a search of a case, the hypothesis that holds what is concealed, and its problem; SrfError where there is none."""
+    registry = bundled_registry()
+    search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
+    hypothesis, experiment = right_hypothesis(search, concealed), search.experiment
+    if concealed["noise"] == "one run louder":
+        experiment = replace(experiment, vary=(GAUGE_NOISE,), by="run")
+    return search, hypothesis, hypothesis.problem(registry, experiment)
+
+
 def fitted(folder: Path, concealed: dict[str, Any]) -> tuple[str, float, float, float, bool]:
     """Return the model that holds what is concealed, its log evidence and likelihood, `white`, whether it saw all readings."""
-    registry, truth = bundled_registry(), known_physics(concealed)
-    search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
-    hypothesis = right_hypothesis(search, concealed)
-    louder = concealed["noise"] == "one run louder"
-    own = replace(search.experiment, vary=(GAUGE_NOISE,), by="run") if louder else search.experiment
-    problem = hypothesis.problem(registry, own)
+    truth, (search, hypothesis, problem) = known_physics(concealed), right_problem(folder, concealed)
     likelihood = Likelihood(problem, processes=PROCESSES.get(concealed["noise"], ("relaxation",)), rtol=RTOL)
     values, stated = likelihood.values(likelihood.start), known_physics(concealed, baseline=True)
     values |= {n: float(getattr(stated, LAWS[n])) for n in problem.names if n in LAWS and getattr(stated, LAWS[n])}

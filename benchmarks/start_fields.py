@@ -20,14 +20,11 @@ from typing import Any
 
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
-from at_the_truth import right_hypothesis
+from at_the_truth import right_problem
 from common import Report
 
 from srfcli.core.errors import SrfError
-from srfcli.data.experiment import read_experiment
-from srfcli.diagnosis.search import ModelSearch
 from srfcli.inference.state_space import FIELD, NOT_CONVERGED, SCORING_STEPS, WIDE, Likelihood, maximise
-from srfcli.laws.registry import bundled_registry
 from srfcli.validation.cases import unseal
 
 FIELDS = (*WIDE, (0.03, 1.0), (0.03, 3.0), (0.02, 10.0), (0.01, 1.0), (0.003, 3.0), (0.003, 0.25))
@@ -39,10 +36,8 @@ Found = dict[tuple[float, float], tuple[float, float, float, bool]]
 def tried(case: tuple[Path, dict[str, Any]]) -> Found | str:
     """Return by field: log likelihood at the start and where it ends, CPU, whether its field has shrunk; a reason for none."""
     folder, concealed = case
-    registry = bundled_registry()
-    search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
     try:
-        likelihood = Likelihood(right_hypothesis(search, concealed).problem(registry, search.experiment), rtol=RTOL)
+        likelihood = Likelihood(right_problem(folder, concealed)[2], rtol=RTOL)
     except SrfError as error:
         return str(error)
     at = [likelihood.names.index(n) for n in FIELD]

@@ -23,15 +23,13 @@ from typing import Any
 
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
-from at_the_truth import right_hypothesis
+from at_the_truth import right_problem
 from common import Report
 
 from srfcli.core.errors import SrfError
-from srfcli.data.experiment import read_experiment
-from srfcli.diagnosis.search import SEARCH_RTOL, ModelSearch
+from srfcli.diagnosis.search import SEARCH_RTOL
 from srfcli.inference import state_space
-from srfcli.inference.state_space import NOT_CONVERGED, SCORING_STEPS, Likelihood, maximise, wide_starts
-from srfcli.laws.registry import bundled_registry
+from srfcli.inference.state_space import SCORING_STEPS, Likelihood, from_any, wide_starts
 from srfcli.validation import apparatus, cases
 from srfcli.validation.cases import Asked, Recipe, unseal
 from srfcli.validation.trials import Trial, begin
@@ -65,10 +63,8 @@ def drawn(trial: Path, n: int, seed: int) -> Trial:
 def fitted(case: tuple[Path, dict[str, Any], tuple[str, ...]]) -> Reached | str:
     """Return by limit what each start reaches in log likelihood, and its CPU; a reason where the right model cannot be made."""
     folder, concealed, limits = case
-    registry = bundled_registry()
-    search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
     try:
-        likelihood = Likelihood(right_hypothesis(search, concealed).problem(registry, search.experiment), rtol=SEARCH_RTOL)
+        likelihood = Likelihood(right_problem(folder, concealed)[2], rtol=SEARCH_RTOL)
     except SrfError as error:
         return str(error)
     file, rng = likelihood.values(likelihood.start), np.random.default_rng(concealed["seed"])
@@ -84,13 +80,11 @@ def fitted(case: tuple[Path, dict[str, Any], tuple[str, ...]]) -> Reached | str:
 
 
 def _reached(likelihood: Likelihood, start: dict[str, float]) -> tuple[float, float]:
-    since, highest, at = time.process_time(), -np.inf, likelihood.names.index("field_amplitude")
-    for x in wide_starts(likelihood, start, lambda text: None):
-        best = maximise(likelihood, x, steps=SCORING_STEPS // 2, close=1.0)
-        highest = max(highest, best.point.log_likelihood)
-        if best.away < NOT_CONVERGED and best.point.x[at] < x[at]:
-            break
-    return highest, time.process_time() - since
+    def quiet(text: str) -> None: ...
+
+    since = time.process_time()
+    found = from_any(likelihood, wide_starts(likelihood, start, quiet), SCORING_STEPS // 2, quiet)
+    return found.point.log_likelihood if found else -np.inf, time.process_time() - since
 
 
 def _cases(trial: Trial, limits: tuple[str, ...]) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...]]]:

@@ -421,15 +421,16 @@ static void fresh_gauge(Course *course, Belief *b, const dual *gauge) {
 }
 
 /* One run: innovations nu (nt), their variances S (nt) and the derivatives of both (nt, LANES), at the readings where `used`; all
-   get the mean (nt, na), covariance (nt, na, na), transition (nt, na, na) from the reading before and the reading's gradient
-   (nt, na), before they are used, and how states follow it (nt, na), 0 if held, where those are wanted. Several signals may be read at one time: `t` (nt) does not fall,
-   and `signal` (nt) says which it is. A reading is `factor` times what it `shows` (nt) plus offset plus gauge noise of variance R:
-   GAUGE the elongation as the gauge has it, SPRING as it is, where spring weighs by `weighs` (nt), 0 or 1, with which parameter
-   `weighed` is replaced (-1 for none); from 0 on a state. The processes of coloured noise have `order` (ng) states each, belong to
-   the signal `owner` (ng), and have parameters gauge (rates, ng, 3); which of the rates holds at a reading is `rate` (nt): where it
-   changes, a noise begins that owes nothing to the one before. A reading moves no state by more than `farthest` (NX). p holds dual
-   numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset, R (nt) and farthest. Returns how many readings were reached; stats: steps,
-   rejected, readings that were held to `farthest`. */
+   get the mean (nt, na), covariance (nt, na, na), transition (nt, na, na) from the reading before and the reading's gradient (nt,
+   na), before they are used, and how states follow it (nt, na), 0 if held, where those are wanted. Several signals may be read at
+   one time: `t` (nt) does not fall, and `signal` (nt) says which it is. A reading is `factor` times what it `shows` (nt) plus
+   offset plus gauge noise of variance R: GAUGE the elongation as the gauge has it, SPRING as it is, where spring weighs by
+   `weighs` (nt), 0 or 1, with which parameter `weighed` is replaced (-1 for none); from 0 on a state. The processes of coloured
+   noise have `order` (ng) states each, belong to the signal `owner` (ng), and have parameters gauge (rates, ng, 3); which of the
+   rates holds at a reading is `rate` (nt): where it changes, a noise begins that owes nothing to the one before. A reading moves
+   no state by more than `farthest` (NX). p holds dual numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too,
+   as do gauge, factor, offset, R (nt) and farthest. Returns how many readings were reached; stats: steps, rejected, readings that
+   were held to `farthest`. */
 int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, const double *farthest, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *gains, double *stats, const volatile int *stop) {
     double values[NP];
     dual q[NP], colour[3 * GAUGE_PROCESSES * SIGNALS], y[NX], one, g[NX], bound[NX];

@@ -19,7 +19,6 @@ from srfcli.core.errors import SrfError
 from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.integrators import doubles, imposed_arguments, interruptible, rtol_of_estimate
 
-FARTHEST_UPDATE = 3.0  # of ln v and ln PHI, a factor of 20 in v and PHI; standard deviations of the field
 STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
 
 GAUGE, SPRING = -1, -2  # what a reading shows: the elongation as the gauge has it, or as it is; from 0 on a state
@@ -134,9 +133,9 @@ def kalman_filter(
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
     numbers in the same k directions. A reading moves ln v and ln PHI by no more than `farthest`, and the field by as many of its
     standard deviations, as what it says of them is linear: beside the fall of a stick-slip cycle that may be a velocity of any
-    size, which cannot be followed. Each
-    reading is still predicted from those before it alone, so that the likelihood is one. After `most` steps, 50 a sample if left
-    out, the rest is NaN. Raises SrfError without a compiler, or for a model without a random friction field.
+    size, which cannot be followed. Each reading is still predicted from those before it alone, so that the likelihood is one.
+    After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a compiler, or for a model without a
+    random friction field.
     """
     if "field_gain" not in model.namespace:
         raise SrfError(f"{model.title} has no random friction field", "open_model(..., random_field=True)")
@@ -182,12 +181,12 @@ def kalman_filter(
 
 def _bounds(model: GeneratedModel, p: Dual, farthest: float) -> Dual:
     """Return by how much a reading may move each state (n,), without end but for logarithms and the field."""
+    if np.isinf(farthest):
+        return Dual.plain(np.full(len(model.states), np.inf), p.d.shape[-1])
     amplitude = model.index("field_amplitude")
     random = np.isin(model.states, ("field", "field_slope"))
-    bounded = np.isfinite(farthest) & (random | np.array([s.startswith("ln_") for s in model.states]))
-    size = farthest if np.isfinite(farthest) else 0.0
-    own = np.where(bounded, size * np.where(random, p.v[amplitude], 1.0), np.inf)
-    return Dual(own, size * np.outer(random & bounded, p.d[amplitude]))
+    unit = np.where(random, p.v[amplitude], [1.0 if s.startswith("ln_") else np.inf for s in model.states])
+    return Dual(farthest * unit, farthest * np.outer(random, p.d[amplitude]))
 
 
 @dataclass(frozen=True)

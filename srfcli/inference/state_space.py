@@ -32,18 +32,7 @@ from srfcli.data.noise import calm_level, carried
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, inverse
-from srfcli.inference.kalman import (
-    FARTHEST_UPDATE,
-    GAUGE,
-    SPRING,
-    Dual,
-    Innovations,
-    Kept,
-    Signals,
-    Smoothed,
-    kalman_filter,
-    smooth,
-)
+from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
     TINY,
@@ -97,6 +86,7 @@ NEIGHBOUR_STEPS = (16, 64)  # of two standard errors to either side, least and m
 HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 UNFELT = 1e-6  # twice the log likelihood that a parameter changes between its bounds, below which its score is rounding
+FARTHEST_UPDATE = 3.0  # by a reading of ln v and ln PHI, a factor of 20 in v and PHI; standard deviations of the field
 FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
 BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
 CREEP = 0.01  # share of what the score promises that a step must gain where readings are weighted, or they are weighted otherwise
@@ -1257,25 +1247,10 @@ def _fitted(
     wide = likelihood(False, processes or ())
     fresh = "field_amplitude" not in start
 
-    def from_any(starts: Iterable[Array], wide: Likelihood = wide) -> Maximum | None:
-        """Return the maximum from the first start that leads near one, or the likeliest that was reached from all.
-
-        Under a field that is no narrower than the start's the filter follows the recordings whatever the parameters are: these
-        may have drifted to where no step leads back, and another start is tried.
-        """
-        found: Maximum | None = None
-        at = wide.names.index("field_amplitude")
-        for x in starts:
-            other = maximise(wide, x, steps=SCORING_STEPS // 2 if fresh else 12, close=1.0, progress=progress)
-            if found is None or other.point.log_likelihood > found.point.log_likelihood:
-                found = other
-            if other.away < NOT_CONVERGED and other.point.x[at] < x[at]:
-                break
-        return found
-
-    found = from_any(wide_starts(wide, start, progress))
+    steps = SCORING_STEPS // 2 if fresh else 12
+    found = from_any(wide, wide_starts(wide, start, progress), steps, progress)
     if found is None or (fresh and found.status is Status.INTEGRATION):
-        found = from_any(starts_elsewhere(wide, wide.coordinates(start), progress)[: len(WIDE)])
+        found = from_any(wide, starts_elsewhere(wide, wide.coordinates(start), progress)[: len(WIDE)], steps, progress)
     assert found is not None
     if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
         found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
@@ -1318,7 +1293,7 @@ def _fitted(
     widest = wide.values(wide.start)["field_amplitude"]  # which may stand for colour, and for falls that come as a surprise
     if fresh and processes is None and best.maximum.point.surprising and best.values["field_amplitude"] > widest:
         coloured = likelihood(False, best.likelihood.processes or ("relaxation",))
-        another = from_any(wide_starts(coloured, start, progress), coloured)
+        another = from_any(coloured, wide_starts(coloured, start, progress), steps, progress)
         if another and another.promised > best.log_likelihood:
             other = StateSpaceFit(coloured, maximise(coloured, another.point.x, close=close, progress=progress))
             best = max(best, _with_or_without(other, smooth, likelihood, close, progress), key=lambda f: f.criterion)
@@ -1327,6 +1302,23 @@ def _fitted(
     if fresh and smooth is None and best.smooth:
         best = _with_faint_fields(best, likelihood(False, best.likelihood.processes))
     return best
+
+
+def from_any(rough: Likelihood, starts: Iterable[Array], steps: int, progress: Callable[[str], None]) -> Maximum | None:
+    """Return the maximum from the first start that leads near one, or the likeliest that was reached from all.
+
+    Under a field that is no narrower than the start's the filter follows the recordings whatever the parameters are: these may
+    have drifted to where no step leads back, and another start is tried.
+    """
+    found: Maximum | None = None
+    at = rough.names.index("field_amplitude")
+    for x in starts:
+        other = maximise(rough, x, steps=steps, close=1.0, progress=progress)
+        if found is None or other.point.log_likelihood > found.point.log_likelihood:
+            found = other
+        if other.away < NOT_CONVERGED and other.point.x[at] < x[at]:
+            break
+    return found
 
 
 def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFit:
