@@ -13,10 +13,12 @@ from scipy.stats import multivariate_normal
 
 from srfcli.codegen.c_source import compiler
 from srfcli.core.errors import SrfError, Status
+from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run, Signal
-from srfcli.inference.fit import Interrupted, Problem, fit_problem, inverse
+from srfcli.inference.fit import Problem, fit_problem, inverse
 from srfcli.inference.prediction import predict
 from srfcli.inference.state_space import (
+    Interrupted,
     Likelihood,
     StateSpaceFit,
     as_fit,
@@ -545,9 +547,13 @@ def test_a_model_without_a_field_has_no_filter(make_model):
         filter_run(make_model(**PMMA), own.experiment, own.run, own.values | FIELD | {"gauge_white": 0.02})
 
 
-def test_ctrl_c_keeps_the_likeliest_point_and_says_so(make_model):
+@pytest.mark.parametrize("many", [10**6, 400])
+def test_ctrl_c_keeps_the_likeliest_point_and_says_so(make_model, monkeypatch, many):
+    """In the fit to a part of the readings, too, whose noise is known by other sampling intervals."""
+    monkeypatch.setattr("srfcli.inference.state_space.MANY_READINGS", many)
     model, calls = make_model(**ROCK, random_field=True), []
-    problem = fit_problem(model, made(make_model(**ROCK, tables=(("mu", "slip"),)), 6, 1e-3))
+    experiment = grouped(made(make_model(**ROCK, tables=(("mu", "slip"),)), 6, 1e-3), ["noise"], "run", None)
+    problem = fit_problem(model, experiment)
 
     def stop(text):
         calls.append(text)
@@ -556,10 +562,17 @@ def test_ctrl_c_keeps_the_likeliest_point_and_says_so(make_model):
 
     with pytest.raises(Interrupted) as caught:
         fit_state_space(problem, progress=stop)
-    kept = as_fit(stopped(problem, caught.value.values))
+    assert (caught.value.found.likelihood.problem is problem) == (many > 400)
+    likely = stopped(problem, caught.value.found)
+    for name in ("A", "D0", "field_amplitude"):
+        assert likely.values[name] == caught.value.found.values[name]
+    white = [[f.values[n] for n in f.likelihood.names if "white" in n] for f in (likely, caught.value.found)]
+    assert white[0] == white[1] and len(white[0]) == len(problem.runs) > 1
+    kept = as_fit(likely)
     assert kept.status is Status.INTERRUPTED and np.isfinite(kept.log_likelihood)
     first = Likelihood(problem)
-    assert kept.log_likelihood > first.at(first.start).log_likelihood
+    if many > 400:
+        assert kept.log_likelihood > first.at(first.start).log_likelihood
     assert all(np.isfinite(list(kept.stderr.values())))
 
 

@@ -27,7 +27,7 @@ from srfcli.diagnosis.discrepancy import (
 )
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import Diagnosis, conclude
-from srfcli.inference.fit import Interrupted
+from srfcli.inference.state_space import Interrupted
 from srfcli.laws.effect_file import formula_text
 from srfcli.laws.registry import bundled_registry, load_registry, read_law
 from srfcli.tasks.law_check import check_law

@@ -110,14 +110,6 @@ class Fit:
         return float(np.sqrt(np.sum(sizes * np.array(ratios)) / np.sum(sizes))) if sizes.size else float("nan")
 
 
-class Interrupted(Exception):
-    """Carries the best parameters found before the user stopped the fit."""
-
-    def __init__(self, values: dict[str, float]) -> None:
-        super().__init__("interrupted")
-        self.values = values
-
-
 @dataclass(frozen=True)
 class Problem:
     """What is fitted to what: the free parameters with their bounds, and the runs and tables of critical loads that judge them.

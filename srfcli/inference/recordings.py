@@ -13,9 +13,9 @@ from srfcli.codegen.model import Array, open_model
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment, Run
-from srfcli.inference.fit import BetweenGroups, Fit, Interrupted, Problem, fit_problem, scatter_of
+from srfcli.inference.fit import BetweenGroups, Fit, Problem, fit_problem, scatter_of
 from srfcli.inference.shared_field import fit_shared
-from srfcli.inference.state_space import NEEDED, StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
+from srfcli.inference.state_space import NEEDED, Interrupted, StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
 from srfcli.laws.registry import Registry
 
 # The fit of an experiment's recordings as `srf fit` makes it: which likelihood, which starts, whose random friction field.
@@ -129,7 +129,7 @@ def fit_recordings(
     try:
         several = fit_from_several(problem, smooth=smooth, count=starts, seed=seed, progress=progress)
     except Interrupted as error:
-        found = stopped(problem, error.values)
+        found = stopped(problem, error.found)
         return RecordingFit(problem, as_fit(found), found, _track(found), (), Status.INTERRUPTED)
     found, best = several.best, as_fit(several.best)
     status = Status.INTERRUPTED if several.interrupted else best.status

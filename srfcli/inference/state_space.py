@@ -31,7 +31,7 @@ from srfcli.data.gauge import CORRELATION_TIMES, FASTEST_OSCILLATION, PROCESSES,
 from srfcli.data.noise import calm_level, carried
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
-from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, inverse
+from srfcli.inference.fit import Fit, Problem, RunFit, inverse
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
@@ -1111,6 +1111,14 @@ def _unfinished(maximum: Maximum) -> float:
     return 0.5 * maximum.away**2 if maximum.away < TOLD else 0.0
 
 
+class Interrupted(Exception):
+    """Carries the likeliest fit, perhaps to a part of the readings, before the user stopped it; None if there was none yet."""
+
+    def __init__(self, found: StateSpaceFit | None) -> None:
+        super().__init__("interrupted")
+        self.found = found
+
+
 def fit_state_space(
     problem: Problem,
     *,
@@ -1159,8 +1167,10 @@ def fit_state_space(
         found = _surveyed(found, close, progress) if problem.tables else found
         return replace(found, evaluations=sum(own.evaluations for own in tried) + (part.evaluations if part else 0))
     except KeyboardInterrupt as error:
-        last = next((own.best for own in reversed(tried) if own.best is not None), None)
-        raise Interrupted(last.values if last else problem.named(problem.start)) from error
+        likely = [
+            StateSpaceFit(own, Maximum(own.best, np.inf, Status.INTERRUPTED, own.best.information)) for own in tried if own.best
+        ]
+        raise Interrupted(max(likely, key=lambda f: f.log_likelihood, default=None)) from error
 
 
 def with_priors(found: StateSpaceFit, priors: Sequence[tuple[tuple[str, ...], float]]) -> StateSpaceFit:
@@ -1186,11 +1196,11 @@ def _surveyed(found: StateSpaceFit, close: float, progress: Callable[[str], None
     return StateSpaceFit(own, maximum)
 
 
-def stopped(problem: Problem, values: Mapping[str, float]) -> StateSpaceFit:
+def stopped(problem: Problem, found: StateSpaceFit | None) -> StateSpaceFit:
     """Return the state of a fit that was stopped: its parameters, with errors as if they were the maximum."""
-    processes = processes_in({name.partition("[")[0] for name in values})
-    likelihood = Likelihood(problem, smooth=not values.get("field_amplitude"), processes=processes)
-    point = likelihood.at(likelihood.coordinates(values))
+    smooth, processes = (found.smooth, found.likelihood.processes) if found else (True, ())
+    likelihood = Likelihood(problem, smooth=smooth, processes=processes)
+    point = likelihood.at(likelihood.coordinates(_carried(found, likelihood) if found else {}))
     return StateSpaceFit(likelihood, Maximum(point, np.inf, Status.INTERRUPTED, inverse(point.information)), 1)
 
 

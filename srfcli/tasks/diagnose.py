@@ -17,7 +17,7 @@ from srfcli.diagnosis.discrepancy import best_form, explain_unknown
 from srfcli.diagnosis.residual_scan import locate
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import conclude
-from srfcli.inference.fit import Interrupted
+from srfcli.inference.state_space import Interrupted
 from srfcli.laws.registry import Registry, load_registry
 from srfcli.laws.values import Effect
 from srfcli.results.diagnosis import DiagnosisResult
