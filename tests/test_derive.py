@@ -292,6 +292,12 @@ def test_unknown_law_is_one_line() -> None:
     assert result.exit_code != 0
 
 
+@pytest.mark.parametrize("command", ["derive", "code"])
+def test_a_value_is_no_part_of_formulas(command: str) -> None:
+    result = CliRunner().invoke(cli, [command, "--K", "3"])
+    assert result.exit_code == 2 and "K is given a value" in result.stderr
+
+
 def test_out_does_not_overwrite(tmp_path: Path) -> None:
     place = tmp_path / "derivation.tex"
     assert run("--format", "latex", "--out", str(place)).exit_code == 0

@@ -208,6 +208,14 @@ def test_an_unknown_effect_is_told_before_anything_is_fitted(experiment: Path) -
     assert "unknown effect 'linker-dietrich'" in done.stderr and "linker-dieterich" in done.stderr
 
 
+def test_where_every_run_is_held_out_there_is_nothing_to_fit(experiment: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(experiment, copy)
+    text = (copy / "experiment.toml").read_text()
+    (copy / "experiment.toml").write_text(text.replace("holdout = false", "holdout = true"))
+    assert "every run is held out" in srf("diagnose", copy, code=2).stderr
+
+
 def test_held_out_files_are_opened_when_the_models_are_final(
     experiment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -58,6 +58,8 @@ REFUSED = [
     ("Vsta*v", 0, "Did you mean 'Vsat'?"),
     ("v + vsat", 4, "Did you mean 'Vsat'?"),
     ("lg(v)", 0, "Did you mean 'log'?"),
+    ("A*log10(v)", 2, "Write log(x)/log(10)."),
+    ("abs(v)", 0, "derivatives everywhere"),
     ("log", 0, "Write log(...)"),
     ("log(v, A)", 0, ""),
     ("log()", 0, ""),
@@ -85,7 +87,6 @@ REFUSED = [
     ("sqrt(v**2)", None, ""),
     ("1e101", 0, ""),
     ("9" * 41, 0, ""),
-    ("abs(v)", 0, ""),
 ]
 
 

@@ -90,6 +90,59 @@ FORMS = {
     "area": (["time [s]", "Angular speed [rpm]", "Torque [mN m]", "Fn [N]"], (1, DEGREES / 6, SIGMA * 50 * 25, 50), "tVmS",
              "1250 N m/rad"),
 }  # fmt: skip
+SIGNS = ("+++", "-++", "++-", "-+-", "+-+", "---")  # of drive, load and force in a file
+
+
+@pytest.mark.parametrize("drive", ["x", "V"])
+@pytest.mark.parametrize("signs", SIGNS)
+def test_what_a_rig_counts_negative_is_turned(signs: str, drive: str, step: dict[str, np.ndarray]) -> None:
+    """The runs that are read are those of the same rig with all counted positive."""
+    heading = {"x": "load_point_displacement [um]", "V": "load_point_velocity [um/s]"}[drive]
+    read = []
+    for name, some in (("plain", "+++"), ("turned", signs)):
+        V, W, F = (float(f"{sign}1") for sign in some)
+        Path(name).mkdir()
+        columns = [step["t"], V * step[drive], W * step["sigma"], F * step["mu"] * step["sigma"]]
+        table(["time [s]", heading, "normal_load [N]", "force [N]"], columns, f"{name}/a.csv")
+        done = srf("new", f"{name}/a.csv", "--stiffness", "40 N/mm", "--out", name)
+        assert ("the other" in done.stderr) == (some != "+++") and "stands still" not in done.stderr
+        experiment = srfcli.read_experiment(name)
+        assert {n.kind for n in experiment.runs[0].notices}.isdisjoint({"friction"})
+        read.append((experiment.runs[0], experiment.parameters))
+    (plain, values), (turned, same) = read
+    assert np.allclose(turned.friction, plain.friction) and [q.value for q in same] == [q.value for q in values]
+    assert np.allclose(turned.drive(plain.t), plain.drive(plain.t)) and turned.initial == plain.initial
+
+
+def test_a_force_that_is_nothing_is_no_recording(step: dict[str, np.ndarray]) -> None:
+    table(["time [s]", "V [um/s]", "normal_load [N]", "force [N]"], [step["t"], step["V"], step["sigma"], 0 * step["mu"]])
+    done = srf("new", "run1.csv", "--stiffness", "40 N/mm", code=2)
+    assert "run1.csv: column 'force [N]' is 0 throughout" in done.stderr
+
+
+def test_a_drive_that_never_moves_is_a_hold(step: dict[str, np.ndarray]) -> None:
+    table(["time [s]", "V [um/s]", "normal_load [N]", "force [N]"], [step["t"], 0 * step["V"], step["sigma"], step["mu"] * 20])
+    done = srf("new", "run1.csv", "--stiffness", "40 N/mm")
+    assert "kind of experiment: shs, as the drive of run1 does not move" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--stiffness", "-3 N/mm"], "--stiffness: found"),
+        (["--stiffness", "30 N"], "'N' measures N, not N/um"),
+        (["--stiffness", "30 N/mm", "--mass", "-1"], "--mass: found"),
+        (["--stiffness", "30 N/mm", "--window", "200,300"], "--window: no sample of"),
+        (["--stiffness", "30 N/mm", "--radius", "25"], "--radius '25' has no unit"),
+        (["--stiffness", "30 N/mm", "run1.csv"], "run1.csv is named twice"),
+    ],
+)
+def test_a_wrong_option_is_named(options: list[str], message: str, step: dict[str, np.ndarray]) -> None:
+    table(["time [s]", "V [um/s]", "normal_load [N]", "force [N]"], [step["t"], step["V"], step["sigma"], step["mu"] * 20])
+    done = srf("new", "run1.csv", *options, code=2)
+    assert message in done.stderr and "experiment.toml" not in done.stderr and not Path("experiment.toml").exists()
+
+
 RIGS = {"rotary": ["--radius", "25 mm"], "strain": ["--thickness", "4 mm"], "area": ["--radius", "25 mm", "--area", "50 mm^2"]}
 
 

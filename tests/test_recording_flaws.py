@@ -88,6 +88,10 @@ def saturation(c: Columns) -> None:
     c.u = np.minimum(c.u + 0.5 * np.sin(c.t), 9.7)
 
 
+def constant(c: Columns) -> None:
+    c.u[:] = 9.0
+
+
 def quantisation(c: Columns) -> None:
     c.u = np.round(c.u / 0.05) * 0.05
 
@@ -161,6 +165,7 @@ FLAWS: dict[str, tuple[Callable[[Columns], None], str]] = {
     "spike": (spike, "one.csv: rows 701-702, t = 7 to 7.01 s: 2 samples standing out in 'spring', compared as they are; "),
     "reset": (reset, "one.csv: rows 900-901, t = 8.99 to 9 s: 'spring' jumps by "),
     "saturation": (saturation, "at the extreme value 9.7 of 'spring': saturated, not compared"),
+    "constant": (constant, "one.csv: column 'spring': all readings are 9"),
     "quantisation": (quantisation, "one.csv: column 'spring': steps of 0.05, "),
     "load-constant": (load_constant, "constant to its noise of 0.0021 of 5.0"),
     "load-smoothed": (load_smoothed, "which dW/dt would amplify: smoothed by a spline"),

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from click.testing import CliRunner, Result
 
 import srfcli
 from srfcli.cli.main import cli
+from srfcli.codegen.c_source import compiler
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment
 from srfcli.laws.registry import load_registry
@@ -363,6 +365,23 @@ def test_ctrl_c_keeps_the_runs_that_are_done(shared: Path, monkeypatch: pytest.M
     monkeypatch.setattr(integrate, "simulate", interrupted)
     done = simulate(str(shared / "cases" / "open-01"), "--csv", code=130)
     assert {line.split(",")[0] for line in done.stdout.splitlines()[1:]} == {"steps", "stickslip"}
+
+
+@pytest.mark.skipif(compiler() is None, reason="LSODA is not interrupted within a piece")
+def test_ctrl_c_keeps_what_was_reached_of_a_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    from srfcli.motion import integrators
+
+    def interrupted(call: Any, stop: Any) -> int:
+        timer = threading.Timer(0.05, lambda: setattr(stop, "value", 1))
+        timer.start()
+        call()  # days of stick-slip, of which it ends with the step in hand
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(integrators, "interruptible", interrupted)
+    done = simulate("--V", "8", "--W0", "9", "--no-inertia", "--for", "300000", "--rate", "1", "--csv", code=130)
+    rows = [line.split(",") for line in done.stdout.splitlines()[1:]]
+    assert 0 < len(rows) < 300_000 and all(np.isfinite(float(cell)) for row in rows for cell in row)
+    assert f"stopped at t = {float(rows[-1][0]):.6g} s of 300000 s" in done.stderr
 
 
 # what is asked

@@ -69,7 +69,10 @@ def command(files: tuple[Path, ...], out: str | None, force: bool, plugins: tupl
     if out != "-":
         check_target(place, force=force)
     registry = load_registry(plugins)
-    for path in files:
+    places = [path.resolve() for path in files]
+    for number, path in enumerate(files):
+        if places.index(path.resolve()) < number:
+            raise SrfError(f"{path} is named twice", "Name each file once: what counts twice seems known better than it is.")
         open_source(path, registry=registry, format=options["reader"])
     wish = _wish(files, options, registry)
     made = draft(files, place.parent, wish, registry=registry)

@@ -111,8 +111,10 @@ def command(
 def _answered(folder: Path, asked: dict[str, Any], workers: int, limit: float, plugins: tuple[Path, ...]) -> Trial:
     """Return the trial with an answer to every case; Ctrl-C ends the command, and what was answered is kept."""
     from srfcli.laws.registry import load_registry
-    from srfcli.validation.trials import answer_all, begin
+    from srfcli.validation.trials import Trial, answer_all, begin
 
+    if asked["resume"] and not Trial(folder).note.exists():
+        raise SrfError(f"{folder}: there is no trial to go on with", "Leave --resume out to begin one.")
     load_registry(plugins)  # a folder that is none must stop the command, not fail every case
     session = Session.current()
     try:

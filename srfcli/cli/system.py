@@ -92,6 +92,7 @@ def derive(system: SystemOptions, form: str, extra: tuple[str, ...], check_paper
     The coefficients C0, C1, ... are in the form and normalisation of the paper's appendix. --check-paper looks at the
     paper's own model, whatever law is chosen.
     """
+    _check_no_values(system)
     put(_paper(form) if check_paper else _derive(system, form, extra, plain=out is not None), out, force=force)
 
 
@@ -138,4 +139,11 @@ def code(system: SystemOptions, out: Path | None, force: bool) -> None:
 
     Its functions take arrays of any leading shape, real or complex, in um, s, N; the module's PARAMETERS gives their order.
     """
+    _check_no_values(system)
     put(system.model().source, out, force=force)
+
+
+def _check_no_values(system: SystemOptions) -> None:
+    """Raise SrfError for a value of a parameter: formulas are those of all values."""
+    for name in system.flags:
+        raise SrfError(f"{name} is given a value, and formulas are those of all values", "Leave it out.")

@@ -145,7 +145,9 @@ def unit_factor(written: str, unit: str, geometry: Geometry = NO_GEOMETRY, *, wh
     hint, kind = "Give a plain number." if unit == "1" else f"Give a unit of the dimension of {unit!r}.", ""
     if gap[1:3] == (0, 0):
         turns = {(-1, 0): -1, (1, -1): 1, (-2, 1): -2}.get((gap[0], gap[3]))  # torque; angle; torque over angle
-        if turns is not None and (found.powers[2], found.powers[3]) != (0, 0):
+        if found.powers == (0, 0, 1, 0) and wanted.powers == (-1, 0, 1, 0) and not geometry.radius:
+            hint = "A stiffness is a force over a length, as in '30 N/mm'."
+        elif turns is not None and (found.powers[2], found.powers[3]) != (0, 0):
             if geometry.radius:
                 return ratio * geometry.radius**turns / (geometry.area or 1.0 if wanted.powers[2] else 1.0)
             hint = f'A rotary rig needs its radius, from which {unit} follow: [apparatus] radius = "25 mm"'

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
 import tempfile
@@ -27,7 +26,7 @@ from srfcli.core.units import (
     split_quantity,
     unit_factor,
 )
-from srfcli.data.columns import open_source, read_columns
+from srfcli.data.columns import Columns, open_source, read_columns
 from srfcli.data.description import FORMAT, ROLES, check_unit, read_description
 from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.groups import levels
@@ -108,6 +107,9 @@ RIG = {
     "thickness": "of the sheared layer: strain times it is the displacement",
     "area": "of the sheared contact: force over it is the stress",
 }
+OPTIONS = ("stiffness", "mass", "load", "window", "drive", *RIG)  # what the options of `srf new` say in an experiment
+LOADS = {"normal_load", "normal_stress"}
+RIG_EXAMPLES = {"radius": "'25 mm'.", "thickness": "'4 mm'.", "area": "'25 cm^2'."}
 NO_MASS = '# mass = "2.37 kg"   # of the slider; without it the slider is quasi-static'
 
 
@@ -134,7 +136,10 @@ class Wish:
     rig: Mapping[str, str] = field(default_factory=dict)  # radius, thickness and area, as [apparatus] has them
 
     def geometry(self) -> Geometry:
-        """Return what the rig says, in um and mm^2."""
+        """Return what the rig says, in um and mm^2; raises SrfError for a number without a unit."""
+        for key, text in self.rig.items():
+            if not split_quantity(text, name=f"--{key}")[1]:
+                raise SrfError(f"--{key} '{text}' has no unit", "Write it with one: " + RIG_EXAMPLES[key])
         return Geometry(**{k: parse_quantity(v, GEOMETRY_UNITS[k], name=f"--{k}") for k, v in self.rig.items()})
 
 
@@ -333,8 +338,9 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     """
     unit = split_quantity(wish.stiffness, name="--stiffness", example="5e-3 1/um")[1]
     per_load = bool(unit) and find_unit(unit).powers == (-1, 0, 0, 0)
+    geometry = wish.geometry()
     try:
-        unit_factor(unit or "N/um", "1/um" if per_load else "N/um", wish.geometry())
+        unit_factor(unit or "N/um", "1/um" if per_load else "N/um", geometry)
     except SrfError as error:
         hint = error.hint if error.kind == "unit" else "As '0.21 N/um', '1.5 MPa/mm' or '1e-3 1/um'."
         raise SrfError(f"--stiffness '{wish.stiffness}': {error.message}", hint) from error
@@ -344,7 +350,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     for path in files:
         names.append(unused_name(path.stem, "", names))
         headings = open_source(path, registry=registry, format=wish.reader).headings
-        own = name_columns(headings, wish.columns, path=path, per_load=per_load, geometry=wish.geometry())
+        own = name_columns(headings, wish.columns, path=path, per_load=per_load, geometry=geometry)
         lacks = missing(own, wish, path, headings)
         if lacks:
             raise SrfError(lacks[0][1], " ".join(f"Say it with {option}." for option, _ in lacks))
@@ -363,8 +369,6 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     if set(wish.holdout) >= set(sketch.names):
         raise SrfError("--holdout: every run is held out", "Leave one to be fitted.")
     sketch, runs = _read(sketch, registry)
-    if sketch.negative:
-        remarks.append("compression is negative in the file: the load counts with the other sign")
     remarks += told_of_runs(runs, MISREAD)
     modulations = _modulations(runs)
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
@@ -389,36 +393,69 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
 
 def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
     """Return the sketch with a run for each stroke of the files whose drive turns back, and what to say of it."""
-    if sketch.wish.drive is not None:
-        return sketch, []
     with _as_file(sketch.text((), absolute=True)) as file:
         described = read_description(file)
         files: list[Path] = []
         names: list[str] = []
         parts: dict[str, Stroke] = {}
         told: list[str] = []
+        signs: list[dict[str, int]] = []
+        backward: list[str] = []
         for run in described.runs:
             source = open_source(run.file, registry=registry, format=run.format)
             columns = read_columns(run, source, described.columns, geometry=described.apparatus.geometry)
             rising = np.isfinite(columns.seconds) & (np.diff(columns.seconds, prepend=-np.inf) > 0)
-            found = strokes(columns.kept(rising))
+            found = strokes(columns.kept(rising)) if sketch.wish.drive is None else []
             shown = found[:STROKES]
             files += [run.file] * max(len(shown), 1)
             names += [f"{run.name}-{k + 1}" for k in range(len(shown))] or [run.name]
             parts |= {f"{run.name}-{k + 1}": stroke for k, stroke in enumerate(shown)}
+            signs.append(_signs(columns, bool(found)))
+            if signs[-1].get("observed", 1) < 0:
+                backward.append(run.name)
+                told.append(f"{run.name} is sheared with a negative sign: its observable counts with the other one")
             if found:
                 some = f", of which the first {STROKES} are written" if len(found) > STROKES else ""
                 told.append(f"{run.name} slides to and fro: {len(found)} strokes{some}, a run each, from half the force on")
-    return replace(sketch, files=tuple(files), names=names, strokes=parts, free=tuple(parts)), told
+    turned = {role for role in set().union(*signs) - {"observed"} if all(own.get(role, 1) < 0 for own in signs)}
+    if turned & LOADS:
+        told.append("compression is negative in the file: the load counts with the other sign")
+    if turned - LOADS:
+        told.append("the drive goes backward in the file where the slider is sheared forward: it counts with the other sign")
+    sketch = replace(sketch, files=tuple(files), names=names, strokes=parts, free=tuple(parts))
+    return replace(sketch, turned=frozenset(turned), backward=tuple(backward)), told
+
+
+def _signs(columns: Columns, turning: bool) -> dict[str, int]:
+    """Return the signs of the load, of the observable and, where it alone is negative, of the drive; these two of no strokes."""
+    arrays, found = columns.arrays, {}
+    if (load := columns.role(*sorted(LOADS))) is not None:
+        found[load] = -1 if np.nanmax(arrays[load]) < 0 else 1
+    observed, drive = columns.role(*OBSERVED), columns.role("load_point_velocity", "load_point_displacement")
+    if observed is None or turning:
+        return found
+    if not np.any(arrays[observed]):
+        raise SrfError(f"{columns.place(observed).column} is 0 throughout", f"Name another column: --column {observed}=HEADING.")
+    found["observed"] = -1 if np.nanmedian(arrays[observed]) < 0 else 1
+    if drive is not None and found["observed"] > 0:
+        moves = arrays[drive][np.isfinite(arrays[drive])]
+        gone = float(np.sum(moves if drive == "load_point_velocity" else np.diff(moves)))
+        found[drive] = -1 if gone < 0 else 1
+    return found
 
 
 @contextmanager
 def _as_file(text: str) -> Iterator[Path]:
-    """Give a file that holds a description, as long as it is read."""
+    """Give a file that holds a description, as long as it is read; what is wrong in it is told by the option that said it."""
     with tempfile.TemporaryDirectory() as home:
         file = Path(home) / "experiment.toml"
         file.write_text(text, encoding="utf-8")
-        yield file
+        try:
+            yield file
+        except SrfError as error:
+            plain = re.sub(rf"{re.escape(str(file))}(, line \d+)?: ", "", error.message)
+            error.message = re.sub(rf"^(?:apparatus|runs\[\d+\])\.({'|'.join(OPTIONS)}): ", r"--\1: ", plain)
+            raise
 
 
 @dataclass(frozen=True)
@@ -437,7 +474,8 @@ class _Sketch:
     durations: Mapping[str, float] = field(default_factory=dict)
     strokes: Mapping[str, Stroke] = field(default_factory=dict)  # by name, where a file holds several
     several: bool = False  # whether a run has many steps of the velocity
-    negative: bool = False  # whether a load in compression is negative in the files
+    turned: frozenset[str] = frozenset()  # roles whose columns count with the other sign
+    backward: tuple[str, ...] = ()  # runs, without strokes, whose observable is negative
 
     @property
     def ageing(self) -> str:
@@ -463,7 +501,7 @@ class _Sketch:
         ]
         if parameters:
             lines += ["", "[parameters]   # start values and bounds of what is fitted; a wide bound costs little", *parameters]
-        turned = ("normal_stress", "normal_load") if self.negative else ()
+        turned = self.turned
         said = [n for n in self.columns if n.said or n.role in turned]
         if said:
             lines += ["", "[columns]   # what the headings of the data files mean"]
@@ -492,11 +530,12 @@ class _Sketch:
         stroke = self.strokes.get(name)
         if stroke:
             lines.append(f"window = {toml_value([stroke.begin, stroke.end])}   # s of the file's clock: one stroke")
-            lines += ['direction = "backward"   # drive and observable count with the other sign'] * stroke.backward
         elif wish.window:
             lines.append(f"window = {toml_value(wish.window)}   # s of the file's clock")
         elif not absolute:
             lines.append("# window = [0.0, 100.0]   # only this part of the recording, s of the file's clock")
+        if name in self.backward or (stroke and stroke.backward):
+            lines.append('direction = "backward"   # drive and observable count with the other sign')
         steps = wish.drive or ()
         if isinstance(steps, float):
             steps = [(self.durations.get(name, 1e9), steps)]
@@ -514,10 +553,7 @@ class _Sketch:
 
 
 def _read(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[Run]]:
-    """Return the runs as an experiment reads them, and the sketch with those that have to begin from a free state.
-
-    Loads that are negative throughout are taken with the other sign.
-    """
+    """Return the runs as an experiment reads them, and the sketch with those that have to begin from a free state."""
     while True:
         with _as_file(sketch.text((), absolute=True)) as file:
             try:
@@ -525,12 +561,9 @@ def _read(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[Run]]:
             except StartsAtRest as error:
                 sketch = replace(sketch, free=(*sketch.free, error.run))
             except SrfError as error:
-                apart = error.kind == "no contact"
-                if apart and not sketch.negative:
-                    with contextlib.suppress(SrfError):
-                        return _read(replace(sketch, negative=True), registry)
-                hint = "Take the part in contact: --window FROM,TO in seconds." if apart else error.hint
-                raise SrfError(re.sub(rf"{re.escape(str(file))}(, line \d+)?: ", "", error.message), hint) from None
+                if error.kind == "no contact":
+                    error.hint = "Take the part in contact: --window FROM,TO in seconds."
+                raise
 
 
 def _kind(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, float]]) -> tuple[str, str]:
@@ -541,6 +574,8 @@ def _kind(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, flo
     for run in runs:
         V = np.abs(run.drive(run.t))
         sliding = NO_SLIDING * float(V.max()) < V
+        if not sliding.any():
+            return "shs", f"as the drive of {run.name} does not move"
         held = HOLD_SPEED * float(V[sliding].min()) > V
         if held[int(np.argmax(sliding)) :].any() and _levels(V[sliding]) < SEVERAL:
             share = float(np.average(held[:-1], weights=np.diff(run.t)))

@@ -18,7 +18,7 @@ from srfcli.data.clock import Mask, Place, Sampling, find_sampling, kept_samples
 from srfcli.data.columns import MOST_BYTES, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, Description, Node, RunDescription, ThresholdsDescription, read_description
 from srfcli.data.gauge import COLOUR_SAMPLES, GaugeNoise, find_noise
-from srfcli.data.groups import BY, TRENDS, grouped
+from srfcli.data.groups import BY, GAUGE_NOISE, TRENDS, grouped
 from srfcli.data.imposed import ACCIDENTS, LOADS, FoundModulation, check_start, drive_of, find_modulation, load_of
 from srfcli.data.noise import WIDEST_SPIKE, observable_jumps, quantisation, saturation, spikes, white_level
 from srfcli.data.scales import own_bounds
@@ -72,6 +72,9 @@ def read_experiment(
         trend=model.read("trend", lambda trend: trend.choice(TRENDS), None), thresholds=tables,
     )  # fmt: skip
     vary = model.read("vary", lambda listed: listed.items("parameters", 'Write vary = ["mu0"].'), [])
+    for entry in vary:
+        if entry.text() not in (free := [*(q.name for q in parameters), GAUGE_NOISE]):
+            entry.fail(f"'{entry.text()}' is to vary, and is not in [parameters]", did_you_mean(entry.text(), free))
     found = grouped(found, [entry.text() for entry in vary], model.read("by", lambda by: by.choice(BY), "run"))
     names = dict.fromkeys([*(run.name for run in described.runs), *(run.name for run in found.runs)])
     for q in found.parameters:
@@ -306,11 +309,18 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
         read = replace(read, notices=(*read.notices, *_late_steps(read, columns.place("load_point_velocity").column)))
     if run.modulation is None and (recorded_load := columns.role(*LOADS)) is not None:
         read = replace(read, notices=(*read.notices, *_load_steps(read, columns.place(recorded_load).column)))
-    friction = float(np.median(read.friction[used])) if used.any() else 1.0
-    if LEAST_FRICTION < abs(friction) < LARGEST_FRICTION:
+    if not used.any():
         return read
-    what = f"the friction coefficient is {friction:.3g}: are the units of what is observed, of load and stiffness right?"
-    return replace(read, notices=(*read.notices, Notice("friction", columns.place(role).column, what)))
+    where, friction = columns.place(role).column, float(np.median(read.friction[used]))
+    if not np.ptp(observed[used]):
+        read = replace(read, notices=(*read.notices, Notice("constant", where, f"all readings are {observed[used][0]:g}")))
+    if LEAST_FRICTION < friction < LARGEST_FRICTION:
+        return read
+    asked = "are the units of what is observed, of load and stiffness right?"
+    if friction < -LEAST_FRICTION:
+        asked = 'where the slider is sheared backward, direction = "backward" in the run says so'
+    what = f"the friction coefficient is {friction:.3g}: {asked}"
+    return replace(read, notices=(*read.notices, Notice("friction", where, what)))
 
 
 def _late_steps(run: Run, where: str) -> list[Notice]:
@@ -449,6 +459,7 @@ NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "spike": "single samples that stand out",
     "reset": "a transducer was set anew",
     "saturation": "samples at the end of the gauge's range",
+    "constant": "an observable that never changes",
     "quantisation": "steps of the gauge that are not small against its noise",
     "load-constant": "a load that varies no more than its noise",
     "load-smoothed": "a load that was smoothed",

@@ -96,6 +96,10 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "lambertw": sp.LambertW,
     "LambertW": sp.LambertW,
 }
+_SMOOTH = "A formula has derivatives everywhere: tanh, sqrt and exp take its place."
+INSTEAD = {  # functions that a formula has not -> what to write
+    "log10": "Write log(x)/log(10).", "log2": "Write log(x)/log(2).", **dict.fromkeys(("abs", "sign", "min", "max"), _SMOOTH)
+}  # fmt: skip
 _HYPERBOLIC = frozenset({"sinh", "cosh", "tanh", "asinh", "atan"})
 # Names that generated modules use themselves; a parameter of that name would shadow them.
 RESERVED = frozenset({"np", "numpy", "x", "t", "tau", "p", "out", "pi", "tan", "arctan", "arcsinh", *FUNCTIONS})
@@ -311,7 +315,7 @@ class _Reader:
         if word not in FUNCTIONS:
             if word in self.known:
                 self.fail(f"'{word}' is not a function", column, f"For a product write {word}*(...).")
-            self.fail(f"unknown function '{word}'", column, did_you_mean(word, FUNCTIONS))
+            self.fail(f"unknown function '{word}'", column, INSTEAD.get(word) or did_you_mean(word, FUNCTIONS))
         if len(node.args) != 1 or isinstance(node.args[0], ast.Starred):
             self.fail(f"'{word}' takes one argument, here are {len(node.args)}", column)
         argument = self.build(node.args[0], depth + 1)

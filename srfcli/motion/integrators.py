@@ -50,6 +50,14 @@ class Motion:
     steps: int
 
 
+class Stopped(KeyboardInterrupt):
+    """Ctrl-C during an integration; `motion` is what was reached."""
+
+    def __init__(self, motion: Motion) -> None:
+        super().__init__()
+        self.motion = motion
+
+
 def integrate(
     model: GeneratedModel,
     p: Array,
@@ -69,7 +77,8 @@ def integrate(
 
     `by` are places in `p`, or -1 for a direction of the initial state alone; S0 (n, k) is the derivative of `start`, zero if left
     out. A model with tables takes them in order; S then ends with a column for each number of the tables in `by_tables`, which
-    rises. `atol` (n,). Errors are local, per step; those of S are held to some tens of times the bound on x.
+    rises. `atol` (n,). Errors are local, per step; those of S are held to some tens of times the bound on x. Ctrl-C raises
+    `Stopped`, where the integration is compiled.
     """
     library = compiled(model)
     count = len(by) + sum(tables[i].numbers.size for i in by_tables)
@@ -93,7 +102,11 @@ def integrate(
         ctypes.c_long(MAX_STEPS),
         t.size, doubles(t), doubles(x), doubles(S), doubles(stats), ctypes.byref(stop),
     )  # fmt: skip
-    filled = interruptible(lambda: library.srf_integrate(*arguments), stop)
+    try:
+        filled = interruptible(lambda: library.srf_integrate(*arguments), stop)
+    except KeyboardInterrupt:
+        filled = int(np.isfinite(x).all(axis=1).sum())
+        raise Stopped(Motion(x, S, Status.INTERRUPTED, float(t[max(filled - 1, 0)]), int(stats[0]))) from None
     status = Status.OK if filled == t.size else Status.INTEGRATION
     return Motion(x, S, status, float(stats[3]), int(stats[0]))
 

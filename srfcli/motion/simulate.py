@@ -15,7 +15,7 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.codegen.splines import Spline, appended
 from srfcli.core.errors import SrfError, Status
 from srfcli.motion.imposed import Drive, Load
-from srfcli.motion.integrators import integrate
+from srfcli.motion.integrators import Stopped, integrate
 
 
 @dataclass(frozen=True)
@@ -62,16 +62,18 @@ def simulate(
     It starts at t[0] in the state `start` (n,), else in steady sliding under the load at rest. The parameters V, W0, eps and f
     in `p` are not used: drive and load stand in their place. A model with tables takes them in order. `atol` is per state; left
     out, it is rtol times 1 for logarithms and lengths (um) and rtol times the largest driving velocity for velocities. Errors
-    are local, per step. Misuse raises SrfError; an integration that stops early is a status.
+    are local, per step. Misuse raises SrfError; an integration that stops early, or is interrupted by Ctrl-C, is a status.
     """
     t, q = np.asarray(t, dtype=float), _parameters(model, p, drive, load, t)
     load.check(t[0], t[-1])
     n = len(model.states)
     tolerances = _absolute(model, drive, t, rtol) if atol is None else np.broadcast_to(np.asarray(atol, float), (n,))
     full = appended(q, tables)
-    motion = integrate(
-        model, q, drive=drive, load=load, t=t, start=_start(model, full, start), tables=tables, rtol=rtol, atol=tolerances
-    )  # fmt: skip
+    begun = _start(model, full, start)
+    try:
+        motion = integrate(model, q, drive=drive, load=load, t=t, start=begun, tables=tables, rtol=rtol, atol=tolerances)
+    except Stopped as stop:
+        motion = stop.motion
     return _trace(model, full, drive, load, t, motion.x, motion.status, motion.reached)
 
 

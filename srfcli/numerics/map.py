@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel, load_source
+from srfcli.core.errors import Status
 from srfcli.core.parallel import run_here
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
@@ -396,6 +397,8 @@ def settle(model: GeneratedModel, p: Array, start: Array, edges: Array) -> Discr
     tau = np.concatenate([edges[:-1, None], last.phases], axis=1)
     t = np.concatenate([[0.0], (SETTLING + tau.reshape(-1)) / f])
     trace = simulate(model, p, drive=Drive.constant(V), load=Modulation(W0, eps, f), t=t, start=start, rtol=1e-6)
+    if trace.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
     if not trace.status.ok:
         return None
     x = trace.x[1:].reshape(len(edges) - 1, STAGES + 1, -1)

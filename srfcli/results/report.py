@@ -6,6 +6,7 @@ import base64
 import html
 import importlib.util
 import json
+import logging
 import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -646,7 +647,8 @@ def read_results(folder: Path) -> list[tuple[Path, dict[str, Any]]]:
             continue
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError) as error:
+            logging.getLogger(__name__).warning("%s is left out: it cannot be read: %s", path, error)
             continue
         if isinstance(data, dict) and str(data.get("schema", "")).startswith("srf.") and "rows" in data:
             found.append((path, data))

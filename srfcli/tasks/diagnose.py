@@ -111,6 +111,8 @@ def diagnose(
         return grouped(found, vary, by, trend)
 
     fitted = read(holdout=False).fitted()
+    if not (fitted.runs or fitted.thresholds):
+        raise SrfError(f"{fitted.path}: every run is held out", "Set holdout = false for those that are to be fitted.")
     if not fitted.runs and (fitted.trend or vary):
         raise SrfError(f"`{'trend' if fitted.trend else 'vary'}` is for recordings, and there are none", "Leave it out.")
     if compiler() is None and fitted.runs:
