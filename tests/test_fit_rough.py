@@ -214,7 +214,7 @@ def test_steps_up_and_down_and_strokes_are_groups(ladder, tmp_path):
         ('by = "sement"', "segment"),
         ('trend = "slop"', "slip"),
         ('vary = "mu0"', 'vary = ["mu0"]'),
-        ('vary = ["E"]', "is to vary, and is not free"),
+        ('vary = ["E"]', "model.vary[0]: 'E' is to vary, and is not in [parameters]"),
     ],
 )
 def test_what_varies_is_checked_where_it_is_written(line, what, ladder, tmp_path):

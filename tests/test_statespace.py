@@ -20,10 +20,12 @@ from srfcli.inference.prediction import predict
 from srfcli.inference.state_space import (
     Interrupted,
     Likelihood,
+    Maximum,
     StateSpaceFit,
     as_fit,
     filter_run,
     fit_state_space,
+    from_any,
     maximise,
     stopped,
     with_less_colour,
@@ -574,6 +576,31 @@ def test_ctrl_c_keeps_the_likeliest_point_and_says_so(make_model, monkeypatch, m
     if many > 400:
         assert kept.log_likelihood > first.at(first.start).log_likelihood
     assert all(np.isfinite(list(kept.stderr.values())))
+
+
+def test_one_more_start_is_tried_where_a_parameter_went_to_its_bound(make_model, monkeypatch):
+    problem = fit_problem(make_model(**ROCK, random_field=True), made(make_model(**ROCK, tables=(("mu", "slip"),)), 6, 1e-3))
+    rough, tried = Likelihood(problem), []
+    at, narrower = rough.names.index("field_amplitude"), rough.start.copy()
+    narrower[at] -= 1.0
+    point = rough.at(narrower)
+
+    def led(bounded, height):
+        x = narrower.copy()
+        x[0] = rough.lower[0] if bounded else x[0]
+        return Maximum(replace(point, x=x, log_likelihood=height), 0.5, Status.OK, np.zeros((x.size, x.size)))
+
+    for ends, count, best in (
+        ([led(False, 1.0), led(False, 9.0)], 1, 1.0),
+        ([led(True, 1.0), led(False, 2.0), led(False, 9.0)], 2, 2.0),
+        ([led(True, 3.0), led(True, 2.0), led(False, 9.0)], 2, 3.0),
+    ):
+        tried.clear()
+        monkeypatch.setattr(
+            "srfcli.inference.state_space.maximise", lambda *_, ends=ends, **k: tried.append(1) or ends[len(tried) - 1]
+        )
+        found = from_any(rough, [rough.start] * len(ends), 10, str)
+        assert len(tried) == count and found.point.log_likelihood == best
 
 
 def test_coloured_gauge_noise_is_found(make_model):

@@ -89,7 +89,7 @@ UNFELT = 1e-6  # twice the log likelihood that a parameter changes between its b
 FARTHEST_UPDATE = 3.0  # by a reading of ln v and ln PHI, a factor of 20 in v and PHI; standard deviations of the field
 FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
 BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
-CREEP = 0.01  # share of what the score promises that a step must gain where readings are weighted, or they are weighted otherwise
+CREEP = 0.1  # share of what the score promises that a step must gain where readings are weighted, or they are weighted otherwise
 CONVERGED = 0.1  # standard errors: how far the maximum may still be, by the gradient
 TOLD = 2.0  # standard errors from the maximum to which a fit is moved for a run that it did not know: 2 in log likelihood
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
@@ -1318,16 +1318,20 @@ def from_any(rough: Likelihood, starts: Iterable[Array], steps: int, progress: C
     """Return the maximum from the first start that leads near one, or the likeliest that was reached from all.
 
     Under a field that is no narrower than the start's the filter follows the recordings whatever the parameters are: these may
-    have drifted to where no step leads back, and another start is tried.
+    have drifted to where no step leads back, and another start is tried. One more is, too, where a parameter is at its bound.
     """
     found: Maximum | None = None
-    at = rough.names.index("field_amplitude")
+    bounded = False
+    at, k = rough.names.index("field_amplitude"), len(rough.problem.names)
     for x in starts:
         other = maximise(rough, x, steps=steps, close=1.0, progress=progress)
         if found is None or other.point.log_likelihood > found.point.log_likelihood:
             found = other
-        if other.away < NOT_CONVERGED and other.point.x[at] < x[at]:
+        y = other.point.x
+        inside = np.all((rough.lower < y) & (y < rough.upper), where=np.arange(y.size) < k)
+        if other.away < NOT_CONVERGED and y[at] < x[at] and (inside or bounded):
             break
+        bounded = bounded or not inside
     return found
 
 
