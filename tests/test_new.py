@@ -124,6 +124,7 @@ def test_a_drive_that_never_moves_is_a_hold(step: dict[str, np.ndarray]) -> None
     table(["time [s]", "V [um/s]", "normal_load [N]", "force [N]"], [step["t"], 0 * step["V"], step["sigma"], step["mu"] * 20])
     done = srf("new", "run1.csv", "--stiffness", "40 N/mm")
     assert "kind of experiment: shs, as the drive of run1 does not move" in done.stderr
+    assert "What the load can tell" in srf("check", ".").stdout
 
 
 @pytest.mark.parametrize(

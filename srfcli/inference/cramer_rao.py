@@ -25,6 +25,7 @@ from srfcli.data.clock import Mask
 from srfcli.data.experiment import RunCheck
 from srfcli.data.gauge import whiten
 from srfcli.data.values import Experiment, ModelChoice
+from srfcli.inference.fit import solve_scaled
 from srfcli.inference.prediction import own_names, own_start, predict, run_parameters, stiffness_share
 from srfcli.laws.registry import Registry
 
@@ -203,7 +204,7 @@ def _simulated(question: _Question, check: RunCheck) -> _Told:
     F, k = J.T @ J, len(question.names)
     if own:
         inner = F[k:, k:] + np.diag([12 / w**2 for w in ranges])
-        taken = np.linalg.solve(inner, F[k:, :k])
+        taken = solve_scaled(inner, F[k:, :k])  # a drift with the slip is none where nothing moves
         F, Z = F[:k, :k] - F[:k, k:] @ taken, Z[:, :k] - Z[:, k:] @ taken
     rest = found.y[seen] - short.observed[seen]
     spread = max(float(np.std(short.observed[seen])), 10 * float(sigma.mean())) if seen.any() else 1.0
