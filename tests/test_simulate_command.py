@@ -8,6 +8,7 @@ import json
 import math
 import os
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from click.testing import CliRunner, Result
 import srfcli
 from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiler
+from srfcli.core.errors import Status
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment
 from srfcli.laws.registry import load_registry
@@ -382,6 +384,19 @@ def test_ctrl_c_keeps_what_was_reached_of_a_record(monkeypatch: pytest.MonkeyPat
     rows = [line.split(",") for line in done.stdout.splitlines()[1:]]
     assert 0 < len(rows) < 300_000 and all(np.isfinite(float(cell)) for row in rows for cell in row)
     assert f"stopped at t = {float(rows[-1][0]):.6g} s of 300000 s" in done.stderr
+
+
+def test_an_interrupted_record_ends_the_command_whatever_became_of_others(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from srfcli.motion import simulate as integrate
+
+    real, ends = integrate.simulate, [Status.INTEGRATION, Status.INTERRUPTED]
+
+    def ended(*args: Any, **options: Any) -> Any:
+        return replace(real(*args, **options), status=ends.pop(0))
+
+    monkeypatch.setattr(integrate, "simulate", ended)
+    done = simulate(str(shared / "cases" / "open-01"), "--csv", code=130)
+    assert {line.split(",")[0] for line in done.stdout.splitlines()[1:]} == {"steps", "stickslip"} and not ends
 
 
 # what is asked

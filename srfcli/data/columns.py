@@ -143,6 +143,7 @@ def _guarded(source: Source, columns: tuple[int, ...], reader: Reader, path: Pat
 # Which column plays which role, and its numbers in um, s, N, read block by block inside a window of time.
 
 MOST_BYTES = 512 * 2**20  # bytes of needed columns that are held at a time
+DRIVES = ("load_point_velocity", "load_point_displacement")
 NO_MEASUREMENT = 1e30  # um, s, N: no measurement, but a gauge's word for none
 
 
@@ -212,13 +213,15 @@ def read_columns(
     named = {channel.role: channel for channel in channels}
     arrays = {channel.role: values for channel, values in zip(channels[1:], kept[1:], strict=True)}
     if run.backward:  # a drive may be recorded without its sign
-        for role in ("load_point_velocity", "load_point_displacement"):
-            if (moves := arrays.get(role)) is not None:
-                known = moves[np.isfinite(moves)]
-                gone = known if role == "load_point_velocity" else np.diff(known)
-                arrays[role] = -moves if float(np.sum(gone)) < 0 else moves
+        arrays |= {role: -arrays[role] for role in DRIVES if role in arrays and goes_backward(role, arrays[role])}
     remarks = {c.role: source.remarks[c.heading] for c in channels if c.heading in source.remarks}
     return Columns(run.file, first, rows, kept[0], arrays, named, tuple(notices), remarks)
+
+
+def goes_backward(role: str, moves: Array) -> bool:
+    """Return whether the load point went back in all, by a column (n,) of its velocity or its displacement."""
+    known = moves[np.isfinite(moves)]
+    return float(np.sum(known if role == "load_point_velocity" else np.diff(known))) < 0
 
 
 class Finder:

@@ -26,11 +26,11 @@ from srfcli.core.units import (
     split_quantity,
     unit_factor,
 )
-from srfcli.data.columns import Columns, open_source, read_columns
+from srfcli.data.columns import DRIVES, Columns, goes_backward, open_source, read_columns
 from srfcli.data.description import FORMAT, ROLES, check_unit, read_description
 from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.groups import levels
-from srfcli.data.imposed import StartsAtRest, Stroke, find_modulation, strokes
+from srfcli.data.imposed import LOADS, StartsAtRest, Stroke, find_modulation, strokes
 from srfcli.data.scales import scales_of
 from srfcli.data.values import BOUND_FACTOR, Run, told_of_runs
 from srfcli.laws.registry import Registry
@@ -108,8 +108,6 @@ RIG = {
     "area": "of the sheared contact: force over it is the stress",
 }
 OPTIONS = ("stiffness", "mass", "load", "window", "drive", *RIG)  # what the options of `srf new` say in an experiment
-LOADS = {"normal_load", "normal_stress"}
-RIG_EXAMPLES = {"radius": "'25 mm'.", "thickness": "'4 mm'.", "area": "'25 cm^2'."}
 NO_MASS = '# mass = "2.37 kg"   # of the slider; without it the slider is quasi-static'
 
 
@@ -139,7 +137,8 @@ class Wish:
         """Return what the rig says, in um and mm^2; raises SrfError for a number without a unit."""
         for key, text in self.rig.items():
             if not split_quantity(text, name=f"--{key}")[1]:
-                raise SrfError(f"--{key} '{text}' has no unit", "Write it with one: " + RIG_EXAMPLES[key])
+                unit = "cm^2" if key == "area" else "mm"
+                raise SrfError(f"--{key} '{text}' has no unit", f"Write it with one, as '25 {unit}'.")
         return Geometry(**{k: parse_quantity(v, GEOMETRY_UNITS[k], name=f"--{k}") for k, v in self.rig.items()})
 
 
@@ -236,7 +235,7 @@ def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
 
 def _played(role: str, found: Mapping[str, Named]) -> bool:
     """Return whether a role, or another that makes it needless, is found already."""
-    same = ({"load_point_velocity", "load_point_displacement"}, {"normal_stress", "normal_load"}, set(OBSERVED))
+    same = (set(DRIVES), set(LOADS), set(OBSERVED))
     return any(role in group and group & set(found) for group in same) or role in found
 
 
@@ -310,7 +309,7 @@ def missing(columns: Sequence[Named], wish: Wish, path: Path, headings: Sequence
     if not roles & set(OBSERVED):
         what = "friction, shear stress, force or elongation of the spring"
         lacks.append(("--column shear_stress=HEADING", f"{path}: which column is {what}? It has {listed}"))
-    if wish.drive is None and not roles & {"load_point_velocity", "load_point_displacement"}:
+    if wish.drive is None and not roles.intersection(DRIVES):
         option = "--drive VELOCITY, or --column load_point_displacement=HEADING"
         lacks.append((option, f"{path}: which column is the load point's velocity or displacement? It has {listed}"))
     if wish.load is None and not roles & {"normal_load", "normal_stress", "friction"}:
@@ -324,7 +323,7 @@ def _check_rig(columns: Sequence[Named], wish: Wish, path: Path) -> None:
     needed = {"rad": "radius", "rad/s": "radius", "N*um": "radius"}
     for column in columns:
         kind = _kind_of_unit(column.unit)
-        strain = column.role in ("load_point_displacement", "load_point_velocity") and kind in ("1", "1/s")
+        strain = column.role in DRIVES and kind in ("1", "1/s")
         key = "thickness" if strain else needed.get(kind)
         if key is not None and key not in wish.rig:
             what = "strains need the thickness of the layer" if strain else "a rotary rig needs its radius"
@@ -392,7 +391,10 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
 
 
 def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
-    """Return the sketch with a run for each stroke of the files whose drive turns back, and what to say of it."""
+    """Return the sketch with a run for each stroke of the files whose drive turns back, and what counts with the other sign.
+
+    And what to say of these.
+    """
     with _as_file(sketch.text((), absolute=True)) as file:
         described = read_description(file)
         files: list[Path] = []
@@ -418,9 +420,9 @@ def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
                 some = f", of which the first {STROKES} are written" if len(found) > STROKES else ""
                 told.append(f"{run.name} slides to and fro: {len(found)} strokes{some}, a run each, from half the force on")
     turned = {role for role in set().union(*signs) - {"observed"} if all(own.get(role, 1) < 0 for own in signs)}
-    if turned & LOADS:
+    if turned.intersection(LOADS):
         told.append("compression is negative in the file: the load counts with the other sign")
-    if turned - LOADS:
+    if turned.intersection(DRIVES):
         told.append("the drive goes backward in the file where the slider is sheared forward: it counts with the other sign")
     sketch = replace(sketch, files=tuple(files), names=names, strokes=parts, free=tuple(parts))
     return replace(sketch, turned=frozenset(turned), backward=tuple(backward)), told
@@ -429,18 +431,16 @@ def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
 def _signs(columns: Columns, turning: bool) -> dict[str, int]:
     """Return the signs of the load, of the observable and, where it alone is negative, of the drive; these two of no strokes."""
     arrays, found = columns.arrays, {}
-    if (load := columns.role(*sorted(LOADS))) is not None:
+    if (load := columns.role(*LOADS)) is not None:
         found[load] = -1 if np.nanmax(arrays[load]) < 0 else 1
-    observed, drive = columns.role(*OBSERVED), columns.role("load_point_velocity", "load_point_displacement")
+    observed, drive = columns.role(*OBSERVED), columns.role(*DRIVES)
     if observed is None or turning:
         return found
     if not np.any(arrays[observed]):
         raise SrfError(f"{columns.place(observed).column} is 0 throughout", f"Name another column: --column {observed}=HEADING.")
     found["observed"] = -1 if np.nanmedian(arrays[observed]) < 0 else 1
     if drive is not None and found["observed"] > 0:
-        moves = arrays[drive][np.isfinite(arrays[drive])]
-        gone = float(np.sum(moves if drive == "load_point_velocity" else np.diff(moves)))
-        found[drive] = -1 if gone < 0 else 1
+        found[drive] = -1 if goes_backward(drive, arrays[drive]) else 1
     return found
 
 

@@ -16,7 +16,7 @@ from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError
 from srfcli.core.units import is_stress
 from srfcli.data.clock import Place, kept_samples
-from srfcli.data.columns import MOST_BYTES, Columns, Finder, open_source
+from srfcli.data.columns import DRIVES, MOST_BYTES, Columns, Finder, open_source
 from srfcli.data.description import RunDescription
 from srfcli.data.noise import NOISE_SAMPLES, quantisation, saturation, spikes, white_level
 from srfcli.data.values import OBSERVABLES, Declared
@@ -33,7 +33,7 @@ def drive_of(run: RunDescription, columns: Columns) -> tuple[Drive, list[Notice]
 
     Raises SrfError for a run that slides in both directions.
     """
-    t, role = columns.seconds, columns.role("load_point_velocity", "load_point_displacement")
+    t, role = columns.seconds, columns.role(*DRIVES)
     if run.drive is not None:
         declared = declared_drive(run, columns, run.drive)
         return declared, [] if role is None else drive_differs(declared, t, columns.arrays[role], columns.place(role).column)

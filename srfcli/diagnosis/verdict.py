@@ -385,12 +385,7 @@ def interesting(score: Score) -> float:
 
 def at_bounds(fitted: Fitted) -> list[str]:
     """Return the model's parameters that stand at a bound, those of field and gauge left out."""
-    likelihood, x = fitted.fit.likelihood, fitted.fit.maximum.point.x
-    return [
-        name
-        for name, value, low, high in zip(likelihood.names, x, likelihood.lower, likelihood.upper, strict=True)
-        if name in likelihood.problem.names and (value <= low or value >= high)
-    ]
+    return fitted.fit.likelihood.at_bounds(fitted.fit.maximum.point.x)
 
 
 def _equivalent(

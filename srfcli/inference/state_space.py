@@ -505,6 +505,11 @@ class Likelihood:
                 x[i] = np.log(max(values[name], 1e-300)) if self.logarithmic[i] else values[name]
         return np.clip(x, self.lower, self.upper)
 
+    def at_bounds(self, x: Array) -> list[str]:
+        """Return the model's parameters that stand at a bound, those of field and gauge left out."""
+        inside = (self.lower < x) & (x < self.upper)
+        return [n for n, within in zip(self.names, inside, strict=True) if n in self.problem.names and not within]
+
     def kinds_of(self, run: Run) -> list[Kind]:
         """Return the kinds of gauge noise of a run: each signal at each of its sampling rates, in its group if noise varies."""
         group = self.problem.noise_group(run)
@@ -1167,9 +1172,11 @@ def fit_state_space(
         found = _surveyed(found, close, progress) if problem.tables else found
         return replace(found, evaluations=sum(own.evaluations for own in tried) + (part.evaluations if part else 0))
     except KeyboardInterrupt as error:
-        likely = [
-            StateSpaceFit(own, Maximum(own.best, np.inf, Status.INTERRUPTED, own.best.information)) for own in tried if own.best
-        ]
+        likely = []
+        for own in tried:
+            if (last := own.best) is not None:
+                unknown = np.full_like(last.information, np.nan)
+                likely.append(StateSpaceFit(own, Maximum(last, np.inf, Status.INTERRUPTED, unknown)))
         raise Interrupted(max(likely, key=lambda f: f.log_likelihood, default=None)) from error
 
 
@@ -1322,13 +1329,13 @@ def from_any(rough: Likelihood, starts: Iterable[Array], steps: int, progress: C
     """
     found: Maximum | None = None
     bounded = False
-    at, k = rough.names.index("field_amplitude"), len(rough.problem.names)
+    at = rough.names.index("field_amplitude")
     for x in starts:
         other = maximise(rough, x, steps=steps, close=1.0, progress=progress)
         if found is None or other.point.log_likelihood > found.point.log_likelihood:
             found = other
         y = other.point.x
-        inside = np.all((rough.lower < y) & (y < rough.upper), where=np.arange(y.size) < k)
+        inside = not rough.at_bounds(y)
         if other.away < NOT_CONVERGED and y[at] < x[at] and (inside or bounded):
             break
         bounded = bounded or not inside

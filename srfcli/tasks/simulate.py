@@ -140,7 +140,7 @@ def simulate_work(
             others = tuple(values if (y := read[name]) is None else y for name, values in shown.items())[1:]
             records.append(Record(job, trace, shown[job.observable], read[job.observable], others))
             if trace.status is Status.INTERRUPTED:
-                break
+                raise KeyboardInterrupt
             progress(job.name, True)
     except KeyboardInterrupt:
         return SimulationResult(work, tuple(records), Status.INTERRUPTED)
