@@ -84,6 +84,8 @@ STEPS = {  # a step: the method that is left out
     "all-runs": "_in_all_runs",
     "one-run": "_in_one_run",
     "elimination": "_eliminate",
+    "further-colour": "_with_more_colour",
+    "after-the-best": "_go_on",
 }
 
 

@@ -12,10 +12,11 @@ from srfcli.codegen.c_source import compiler
 from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import grouped
 from srfcli.data.values import FitParameter
+from srfcli.diagnosis import goodness_of_fit as of_goodness_of_fit
 from srfcli.diagnosis import search as of_search
 from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.scores import Remainder, Scores
-from srfcli.diagnosis.search import ModelSearch
+from srfcli.diagnosis.search import MOST_EFFECTS, ModelSearch
 from srfcli.diagnosis.verdict import conclude
 from srfcli.inference import state_space
 from srfcli.inference.state_space import (
@@ -149,6 +150,37 @@ def test_a_fit_that_the_budget_ended_is_one_that_was_left(ageing):
     search = Ended(SHIPPED, read_experiment(ageing, registry=SHIPPED, holdout=False), effects=FEW)
     assert search.run() is search.baseline and search.cut_short and [*search.fitted] == ["none"]
     assert conclude(search, read_experiment(ageing, registry=SHIPPED)).verdict == "inconclusive"
+
+
+def test_colour_that_no_effect_explains_is_the_gauges(tmp_path):
+    """The noise is of one colour more than the baseline is fitted with, and no effect promises to explain that."""
+
+    class Whiter(ModelSearch):
+        def fit(self, move):
+            self.options = {"processes": ()}
+            try:
+                return super().fit(move)
+            finally:
+                self.options = {}
+
+    folder = recorded(tmp_path, Physics(), gauge=Gauge(lag1=0.3))
+    search = Whiter(SHIPPED, read_experiment(folder, registry=SHIPPED, holdout=False), effects=("linker-dieterich",))
+    white = search.fit(None)
+    assert white.against == ("innovations are correlated",) and not white.fit.likelihood.processes
+    best = search.run()
+    assert best is search.baseline and best.passes and best.fit.likelihood.processes == ("relaxation",)
+    assert best.evidence > white.evidence + 6
+    assert conclude(search, read_experiment(folder, registry=SHIPPED)).verdict == "none"
+
+
+def test_where_nothing_passes_the_models_after_the_best_are_expanded(ageing, monkeypatch):
+    """A limit that no fit can keep: nothing passes, and each model of one effect is asked what it lacks."""
+    monkeypatch.setattr(of_goodness_of_fit, "DEVIATION", 1e-3)
+    search = ModelSearch(SHIPPED, read_experiment(ageing, registry=SHIPPED, holdout=False), effects=FEW[:3])
+    search.run()
+    singles = [f for f in search.fitted.values() if len(f.hypothesis.effects) < MOST_EFFECTS]
+    assert not search.best().passes and len(singles) > 2 and not search.cut_short
+    assert all(f.scores for f in singles) and not search.queue
 
 
 @pytest.mark.slow

@@ -29,6 +29,7 @@ from srfcli.inference.state_space import (
 
 PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
 STEADY = 2.0  # gauge's noise: a stretch whose readings are expected to vary by less is one of steady sliding
+CORRELATED = "innovations are correlated"
 LEVELS = ("gauge_white", "gauge_colour")
 LOUD = 1.15  # gauge noise over that which differences of the recording show, beyond which it holds something else
 REPEATED = 0.72  # share of readings that repeat the one before where a step is four times white noise; at six values are off
@@ -51,7 +52,7 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
                 off = abs(float(f.score[k])) / np.sqrt(information)
                 tests.append((off / DEVIATION, f"the field is of another amplitude in {f.run.name}"))
     tests += _of_loads(found)
-    tests.append((correlated(point) / DEVIATION, "innovations are correlated"))
+    tests.append((correlated(point) / DEVIATION, CORRELATED))
     tests.append((field_share(found), f"the field's amplitude is {values.get('field_amplitude', 0.0):.2g}"))
     tests += loudness(found.likelihood, point)
     return [text for size, text in sorted(tests, reverse=True) if size > 1.0]

@@ -117,6 +117,8 @@ class Remainder:
         self.base = u[:, known]
         self._back = np.zeros((size.size, int(known.sum())))
         self._back[size > 0] = v[known].T / s[known] / size[size > 0][:, None]
+        self._along = np.zeros((int(known.sum()), size.size))  # each parameter's direction in `base`
+        self._along[:, size > 0] = s[known, None] * v[known]
         self.left = self.free(self.rest)
 
     def padded(self, blocks: Sequence[Array]) -> Array:
@@ -131,6 +133,13 @@ class Remainder:
     def shifts(self, taken: Array) -> Array:
         """Return by how much the parameters that were fitted change where something is added that has `taken` (p,) of `base`."""
         return np.asarray(-self._back @ taken)
+
+    def only_by(self, names: Sequence[str], taken: Array) -> Array:
+        """Return the part of what columns have `taken` (p, q) of `base` that parameters besides `names` cannot absorb."""
+        others = self._along[:, ~np.isin(self.fitted.likelihood.names, names)]
+        u, s, _ = np.linalg.svd(others, full_matrices=False)
+        u = u[:, s > 1e-7 * max(s[0], 1e-300)]
+        return np.asarray(taken - u @ (u.T @ taken))
 
     @cached_property
     def runs(self) -> tuple[Filtered, ...]:
@@ -423,12 +432,13 @@ class Scores:
                 best[column.effect.name] = score
         return sorted(best.values(), key=lambda s: -s.gain)
 
-    def absorbed(self, before: Scores) -> list[Score]:
-        """Return the score of each effect of which this fit absorbs what that `before` did not, where it absorbs most."""
-        left = {(c.effect.name, *c.inner.items()): c.tolerance for c in before.columns}
+    def absorbed_by(self, names: Sequence[str]) -> list[Score]:
+        """Return the score of each effect that parameters `names` absorb, and the others do not, where they absorb most of it."""
         least: dict[str, tuple[float, _Column]] = {}
         for column in self.columns:
-            share = column.tolerance / max(left.get((column.effect.name, *column.inner.items()), 0.0), 1e-300)
+            assert column.taken is not None
+            left, absorbed = float(np.sum(column.columns**2)), float(np.sum(self.remainder.only_by(names, column.taken) ** 2))
+            share = left / max(left + absorbed, 1e-300)
             if share < least.get(column.effect.name, (1 - RESEMBLING**2,))[0]:
                 least[column.effect.name] = share, column
         return [self._score(column) for _, column in least.values()]

@@ -24,7 +24,7 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.goodness_of_fit import loudness, shortcomings, taken_up, uneven_noise
+from srfcli.diagnosis.goodness_of_fit import CORRELATED, loudness, shortcomings, taken_up, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
 from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
@@ -46,7 +46,6 @@ from srfcli.inference.state_space import (
     mass_at_bounds,
     maximise,
     processes_in,
-    starts_elsewhere,
     thinned,
     wide_starts,
     with_less_colour,
@@ -65,6 +64,7 @@ BASELINES = 5.0  # times what the baseline took, if that is more: two effects, e
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 BUILT, BUILT_SPAN = 16, 1e3  # sizes of what is built in, a mass or an interface, that are tried; the largest over the least
 FEWEST = 3  # models that are fitted from the file's start values although none has a plausible field: the likeliest
+NEAR_STEPS = 3  # of scoring that tell at first whether a model may be it
 FOLLOWED = 0.1  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
 
@@ -139,6 +139,8 @@ class _Move:
     shifts: Mapping[str, float] = field(compare=False, default_factory=dict)  # of other parameters that go with that
     origin: StateSpaceFit | None = field(compare=False, default=None)  # whose parameters it begins with, as they are
     reached: float = field(compare=False, default=-np.inf)  # log evidence that was reached on the way to what is expected
+    gain: float = field(compare=False, default=np.inf)  # of its last effect, at first order from a fit without field and colour
+    gains: Mapping[tuple[str, str], float] = field(compare=False, default_factory=dict)  # of every effect there, by name and run
 
 
 class _Spent(Exception):
@@ -175,8 +177,8 @@ class ModelSearch:
         self.fitted: dict[str, Fitted] = {}
         self.queue: list[_Move] = []
         self.count = 0
-        self._taken: set[tuple[Callable[[Fitted], Any], str]] = set()  # steps, and of which model
         self._expected: dict[str, float] = {}  # the most that was expected of each effect beside the baseline
+        self._taken: set[tuple[Callable[[Fitted], Any], str]] = set()  # steps, and of which model
         self._tried: dict[str, Array] = {}  # from where each other ageing law was tried last
 
     def progress(self, text: str) -> None:
@@ -343,6 +345,7 @@ class ModelSearch:
                 if self._promising(base):  # what has been likelier, else what is expected to be
                     move = max(self.queue, key=lambda m: (max(m.reached, base.evidence), -m.expected))
                     self._fit_next(self._taken_out(move))
+                self._between_runs()
                 if self.best().name == base.name or not self.best().passes:
                     self._take(self._fit_afresh, base)
             elif not base.passes:
@@ -363,9 +366,21 @@ class ModelSearch:
         while True:
             self._search()
             step, node = next(((s, f) for s, f in steps() if (s, f.name) not in self._taken), (None, None))
-            if step is None or node is None:
+            if step is not None and node is not None:
+                self._take(step, node)
+            elif not self._go_on():
                 return
-            self._take(step, node)
+
+    def _go_on(self) -> bool:
+        """Where no model passes, expand the next best, or fit what promises less than the best; return whether there was any."""
+        other = next(filter(self._expandable, self.ranked()), None)
+        if self.best().passes or self.spent or (other is None and not self.queue):
+            return False
+        if other:
+            self._expand(other)
+        else:
+            self._fit_next(heapq.heappop(self.queue))
+        return True
 
     def _take(self, step: Callable[[Fitted], Any], node: Fitted) -> None:
         step(node)
@@ -438,22 +453,31 @@ class ModelSearch:
     def _search(self) -> None:
         """Fit what comes close to the best model, or would mend it; expand the best once nothing does.
 
-        An effect that was fitted in one run alone, and mends it by halves, is tried in all runs at once.
+        An effect that was fitted in one run alone, and mends it by halves, is tried in all runs at once, and the reverse.
         """
         while not self.spent:
+            self._between_runs()
             best = self.best()
-            if not best.passes and (self._in_all_runs, best.name) not in self._taken:
-                self._take(self._in_all_runs, best)
-                continue
-            if not self._promising(best):
-                if not self._expandable(best):
-                    break
-                if best.passes or (self._fit_afresh, self.baseline.name) in self._taken:
-                    self._expand(best)
-                else:
-                    self._take(self._fit_afresh, self.baseline)
-                continue
-            self._fit_next(heapq.heappop(self.queue))
+            self.queue = [m for m in self.queue if self._outdo(m.gain, m.gains)]
+            heapq.heapify(self.queue)
+            if self._promising(best):
+                self._fit_next(heapq.heappop(self.queue))
+            elif (self._with_more_colour, best.name) not in self._taken:
+                self._take(self._with_more_colour, best)
+            elif not self._expandable(best):
+                break
+            elif best.passes or (self._fit_afresh, self.baseline.name) in self._taken:
+                self._expand(best)
+            else:
+                self._take(self._fit_afresh, self.baseline)
+
+    def _between_runs(self) -> None:
+        """Fit the best model, while it fails a test, with its effects in all runs and with each in one run."""
+        while not (best := self.best()).passes:
+            step = next((s for s in (self._in_all_runs, self._in_one_run) if (s, best.name) not in self._taken), None)
+            if step is None:
+                return
+            self._take(step, best)
 
     def _fit_next(self, move: _Move) -> None:
         """Fit a model that waited; what cannot be fitted is left out, with the reason."""
@@ -518,7 +542,7 @@ class ModelSearch:
             least_likely, fresh = at.fit.log_likelihood - HOPELESS, len(hypothesis.effects) - len(at.hypothesis.effects)
             moves.append(_Move(
                 -(node.attainable + gain + self._one_more), self.count, hypothesis, values, sizes, least_likely, fresh,
-                shifts=own,
+                shifts=own, gain=gain,
             ))  # fmt: skip
         return moves
 
@@ -536,8 +560,8 @@ class ModelSearch:
         that passes, only what promises more than an effect of that.
         """
         best = self.best()
-        passed = best.hypothesis.effects if best.passes and best.name != node.name else None
-        if len(node.hypothesis.effects) == MOST_EFFECTS or passed == () or not taken_up(node.fit):
+        passed = best.passes and best.name != node.name and not best.hypothesis.effects
+        if len(node.hypothesis.effects) == MOST_EFFECTS or passed or not taken_up(node.fit):
             return
         bare = Likelihood(node.fit.likelihood.problem, smooth=True, rtol=SEARCH_RTOL)
         found = maximise(bare, bare.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
@@ -546,16 +570,16 @@ class ModelSearch:
         plain = self._passed(node.hypothesis, StateSpaceFit(bare, found))
         self.progress(f"{node.name}: scores without field and colour")
         scores = self._scores(plain)
-        named = {(e.reported, e.run) for e in passed or ()}
-        gains: dict[bool, list[tuple[float, Score]]] = {False: [], True: []}  # in all runs, in one alone
-        least = WORTH
-        for gain, score in self._gains(scores):
-            if (score.effect.reported, score.effect.run) in named:
-                least = max(least, gain)
-            else:
-                gains[bool(score.effect.run)].append((gain, score))
-        for promised in gains.values():  # as many in one run alone as in all
-            self._push(self._promised(node, plain, promised, least, noise=False))
+        every = sorted(self._gains(scores), key=lambda p: p[0])  # of variants the one that promises most
+        known = {(score.effect.reported, score.effect.run): gain for gain, score in every}
+        for alone in (False, True):  # as many in one run alone as in all
+            promised = [(gain, score) for gain, score in every if bool(score.effect.run) is alone and self._outdo(gain, known)]
+            self._push([replace(m, gains=known) for m in self._promised(node, plain, promised, WORTH, noise=False)])
+
+    def _outdo(self, gain: float, gains: Mapping[tuple[str, str], float]) -> bool:
+        """Return whether a gain is larger than that of each effect of the best model, of the same scores, where that passes."""
+        best = self.best()
+        return not best.passes or all(gain > gains.get((e.reported, e.run), -np.inf) for e in best.hypothesis.effects)
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""
@@ -619,20 +643,31 @@ class ModelSearch:
         self.experiment, self.whole = experiment, whole
         return self._record(self._judged(base.hypothesis, found))
 
+    def _with_more_colour(self, best: Fitted) -> None:
+        """Fit the best model with as much coloured noise as Schwarz's criterion wants, where nothing else speaks against it.
+
+        No effect promises to explain then why innovations are correlated.
+        """
+        if best.against == (CORRELATED,):
+            options = {"processes": None, "cautious": False, **self.options}
+            found = self._state_space(best.fit.likelihood.problem, part=best.fit, **options)
+            self._record(self._judged(best.hypothesis, found))
+
     def _try_rivals(self, best: Fitted) -> None:
         """Fit what does the same at first order in the place of one effect of the best model, or of its ageing law.
 
-        The best model absorbs such an effect, and what is left of the best without its own does not. An ageing law is as likely
-        at the parameters of the best.
+        The parameters of that effect absorb such a one, and the others of the best model do not. An ageing law is as likely at
+        the parameters of the best.
         """
-        effects, ageing, sizes = best.hypothesis.effects, best.hypothesis.ageing, self._sizes(best)
-        if not best.passes or best.scores is None:
+        if not best.passes:
             return
+        effects, ageing, sizes = best.hypothesis.effects, best.hypothesis.ageing, self._sizes(best)
+        model, scores = best.fit.likelihood.problem.model, best.scores
         for i, effect in enumerate(effects):
+            scores = scores or self._scores(best)
             others, own = effects[:i] + effects[i + 1 :], sizes[:i] + sizes[i + 1 :]
-            node = self.fitted.get(Hypothesis(others, ageing).name)
             without = self._height(_Move(0.0, 0, Hypothesis(others, ageing), dict(best.fit.values), own, origin=best.fit))
-            for score in best.scores.absorbed(node.scores) if node and node.scores else []:
+            for score in scores.absorbed_by([*own_parameters(effect, model), *effect.frees]):
                 hypothesis = Hypothesis((*others, score.effect), ageing)
                 if hypothesis.name not in self.fitted:
                     moves = self._instead(best, effect, score, hypothesis, own)
@@ -677,7 +712,7 @@ class ModelSearch:
         return likelihood.at(x, slopes=False).log_likelihood
 
     def _fit_afresh(self, base: Fitted) -> None:
-        """Fit other ageing laws, and effects if the baseline fails a test, from the file's own start values.
+        """Fit other ageing laws, and effects if nothing passes, from the file's own start values.
 
         A field, or noise, may stand for what is missing; the other parameters then end where no step leads to the right model.
         What keeps a field no wider than one may be after a few steps is fitted at once, and the likeliest of the others then;
@@ -688,7 +723,7 @@ class ModelSearch:
             self._try_ageing_laws(best)
             return
         models = list(self._other_laws(best))
-        singles = [Hypothesis((effect,)) for effect in ([] if base.passes else self._joining(base))]
+        singles = [Hypothesis((effect,)) for effect in ([] if base.passes or best.passes else self._joining(base))]
         for single in sorted(singles, key=lambda h: (h.name in self.fitted, -self._expected.get(h.name, -np.inf))):
             known, (effect,) = self.fitted.get(single.name), single.effects
             likelihood = None if known and known.passes else self._likelihood(single, base, effect.reported)
@@ -698,7 +733,8 @@ class ModelSearch:
         for hypothesis, beside in models:
             own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
             start = next(wide_starts(own, {}, self.progress), None)
-            start = starts_elsewhere(own, own.coordinates({}), self.progress)[0] if start is None else start
+            if start is None:
+                continue
             found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
             waiting.append((hypothesis, beside, own, found))
             if not taken_up(StateSpaceFit(own, found)):
@@ -742,9 +778,11 @@ class ModelSearch:
     def _try_ageing_laws(self, best: Fitted) -> None:
         """Push the other ageing laws, each after a few steps from where the baseline or the best model stands.
 
-        The law that promises most goes on from there: the right one lies further off than a step tells.
+        The law that promises most goes on from there: the right one lies further off than a step tells. Where the best model has
+        another law than the stated one, it is to be the likeliest of them, and each is scored to its maximum.
         """
-        reached = [(law[0], *near) for law in self._other_laws(best) if (near := self._near(*law))]
+        whole = bool(best.hypothesis.ageing)
+        reached = [(law[0], *near) for law in self._other_laws(best) if (near := self._near(*law, whole))]
         for number, (hypothesis, likelihood, found) in enumerate(sorted(reached, key=lambda r: -r[2].promised)):
             if number == 0 and found.away > 1.0:
                 found = maximise(likelihood, found.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
@@ -757,8 +795,11 @@ class ModelSearch:
         own = ((h, self._likelihood(h, self.baseline, name)) for name, h in others if h != best.hypothesis)
         return [(hypothesis, likelihood) for hypothesis, likelihood in own if likelihood is not None]
 
-    def _near(self, hypothesis: Hypothesis, likelihood: Likelihood) -> tuple[Likelihood, Maximum] | None:
-        """Return where a few steps lead a law from where the baseline or the best stands; None if they did already."""
+    def _near(self, hypothesis: Hypothesis, likelihood: Likelihood, whole: bool = False) -> tuple[Likelihood, Maximum] | None:
+        """Return where a law is led from where the baseline or the best stands, by a few steps or the whole way.
+
+        None if it was begun there already.
+        """
         parents = {f.name: f for f in (self.baseline, self.best())}.values()
         starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in parents]
         heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts] if len(starts) > 1 else [0.0]
@@ -766,7 +807,8 @@ class ModelSearch:
         if np.array_equal(x, self._tried.get(hypothesis.name, ())):
             return None
         self._tried[hypothesis.name] = x
-        return likelihood, maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
+        how: dict[str, Any] = {} if whole else {"steps": NEAR_STEPS, "widths": ()}
+        return likelihood, maximise(likelihood, x, close=1.0, progress=self.progress, **how)
 
     def _led_to(self, hypothesis: Hypothesis, likelihood: Likelihood, found: Maximum) -> _Move | None:
         """Return a model of one part more, or another law, that goes on from there; None where it promises too little."""
