@@ -364,8 +364,8 @@ def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequenc
         return ""
     if not all(h.augmented.whole for h in held):
         return "held-out runs cannot be followed"
-    if loud := next((f"{h.run.name}: {h.loud}" for h in held if h.loud), ""):
-        return f"held-out runs are not predicted: in {loud}"
+    if loud := next((f"what is left in {h.run.name} as noise, {h.loud}" for h in held if h.loud), ""):
+        return f"held-out runs are not predicted: with {loud}"
     sizes, levels = [h.augmented.white.size for h in held], [h.predictive.rms for h in held]
     rms = float(np.sqrt(np.average(np.square(levels), weights=sizes)))
     if not rms < HELD_OUT_RMS:
