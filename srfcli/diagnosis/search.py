@@ -24,7 +24,7 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.goodness_of_fit import CORRELATED, loudness, shortcomings, taken_up, uneven_noise
+from srfcli.diagnosis.goodness_of_fit import CORRELATED, field_share, loudness, shortcomings, taken_up, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
 from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
@@ -64,6 +64,7 @@ BASELINES = 5.0  # times what the baseline took, if that is more: two effects, e
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 BUILT, BUILT_SPAN = 16, 1e3  # sizes of what is built in, a mass or an interface, that are tried; the largest over the least
 FEWEST = 3  # models that are fitted from the file's start values although none has a plausible field: the likeliest
+ROUGH = 0.33  # of the widest field that a track may have, from where effects are scored without it too: a polished track's
 NEAR_STEPS = 3  # of scoring that tell at first whether a model may be it
 FOLLOWED = 0.1  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
@@ -554,14 +555,15 @@ class ModelSearch:
                 self._expected[name] = max(-move.expected, self._expected.get(name, -np.inf))
 
     def _expand_without_field(self, node: Fitted) -> None:
-        """Push what effects promise from a fit without field and colour, where these have taken up what the model lacks.
+        """Push what effects promise from a fit without field and colour, where these may have taken up what the model lacks.
 
         Under a field that no track has, the scores of what is missing are as low as those of what is not. Beside a best model
         that passes, only what promises more than an effect of that.
         """
         best = self.best()
         passed = best.passes and best.name != node.name and not best.hypothesis.effects
-        if len(node.hypothesis.effects) == MOST_EFFECTS or passed or not taken_up(node.fit):
+        rough = taken_up(node.fit) or field_share(node.fit) > ROUGH
+        if len(node.hypothesis.effects) == MOST_EFFECTS or passed or not rough:
             return
         bare = Likelihood(node.fit.likelihood.problem, smooth=True, rtol=SEARCH_RTOL)
         found = maximise(bare, bare.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
