@@ -64,7 +64,7 @@ BASELINES = 5.0  # times what the baseline took, if that is more: two effects, e
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 BUILT, BUILT_SPAN = 16, 1e3  # sizes of what is built in, a mass or an interface, that are tried; the largest over the least
 FEWEST = 3  # models that are fitted from the file's start values although none has a plausible field: the likeliest
-ROUGH = 0.33  # of the widest field that a track may have, from where effects are scored without it too: a polished track's
+WIDE_FIELD = 0.33  # of the widest field that a track may have, from where effects are scored without it too: a polished track's
 NEAR_STEPS = 3  # of scoring that tell at first whether a model may be it
 FOLLOWED = 0.1  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
@@ -562,7 +562,7 @@ class ModelSearch:
         """
         best = self.best()
         passed = best.passes and best.name != node.name and not best.hypothesis.effects
-        rough = taken_up(node.fit) or field_share(node.fit) > ROUGH
+        rough = taken_up(node.fit) or field_share(node.fit) > WIDE_FIELD
         if len(node.hypothesis.effects) == MOST_EFFECTS or passed or not rough:
             return
         bare = Likelihood(node.fit.likelihood.problem, smooth=True, rtol=SEARCH_RTOL)
