@@ -134,12 +134,10 @@ class Remainder:
         """Return by how much the parameters that were fitted change where something is added that has `taken` (p,) of `base`."""
         return np.asarray(-self._back @ taken)
 
-    def only_by(self, names: Sequence[str], taken: Array) -> Array:
-        """Return the part of what columns have `taken` (p, q) of `base` that parameters besides `names` cannot absorb."""
-        others = self._along[:, ~np.isin(self.fitted.likelihood.names, names)]
-        u, s, _ = np.linalg.svd(others, full_matrices=False)
-        u = u[:, s > 1e-7 * max(s[0], 1e-300)]
-        return np.asarray(taken - u @ (u.T @ taken))
+    def without(self, names: Sequence[str]) -> Array:
+        """Return orthonormal directions (p, r), in `base`, of what was fitted besides the parameters `names`."""
+        u, s, _ = np.linalg.svd(self._along[:, ~np.isin(self.fitted.likelihood.names, names)], full_matrices=False)
+        return np.asarray(u[:, s > 1e-7 * max(s[0], 1e-300)])
 
     @cached_property
     def runs(self) -> tuple[Filtered, ...]:
@@ -435,9 +433,11 @@ class Scores:
     def absorbed_by(self, names: Sequence[str]) -> list[Score]:
         """Return the score of each effect that parameters `names` absorb, and the others do not, where they absorb most of it."""
         least: dict[str, tuple[float, _Column]] = {}
+        others = self.remainder.without(names)
         for column in self.columns:
             assert column.taken is not None
-            left, absorbed = float(np.sum(column.columns**2)), float(np.sum(self.remainder.only_by(names, column.taken) ** 2))
+            left, own = float(np.sum(column.columns**2)), column.taken - others @ (others.T @ column.taken)
+            absorbed = float(np.sum(own**2))
             share = left / max(left + absorbed, 1e-300)
             if share < least.get(column.effect.name, (1 - RESEMBLING**2,))[0]:
                 least[column.effect.name] = share, column

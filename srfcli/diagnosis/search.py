@@ -140,8 +140,8 @@ class _Move:
     shifts: Mapping[str, float] = field(compare=False, default_factory=dict)  # of other parameters that go with that
     origin: StateSpaceFit | None = field(compare=False, default=None)  # whose parameters it begins with, as they are
     reached: float = field(compare=False, default=-np.inf)  # log evidence that was reached on the way to what is expected
-    gain: float = field(compare=False, default=np.inf)  # of its last effect, at first order from a fit without field and colour
-    gains: Mapping[tuple[str, str], float] = field(compare=False, default_factory=dict)  # of every effect there, by name and run
+    gain: float = field(compare=False, default=np.inf)  # of its last effect, at first order
+    gains: Mapping[tuple[str, str], float] = field(compare=False, default_factory=dict)  # without field, of all: by name and run
 
 
 class _Spent(Exception):
@@ -204,7 +204,7 @@ class ModelSearch:
     def fit(self, move: _Move | None) -> Fitted:
         """Return a model fitted from where its parent stands, and judged; the baseline from the file's own start values."""
         hypothesis = move.hypothesis if move else Hypothesis()
-        options = {"processes": _colours(move.values) if move else None, "cautious": True, **self.options}
+        options = {"processes": _colours(move.values) if move else None, **self.options}
         if move:
             options["least"] = self.best().evidence - CLOSE_CALL
 
@@ -235,8 +235,7 @@ class ModelSearch:
         begun = maximise(likelihood, x, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
         if not begun.promised > self.best().evidence - CLOSE_CALL:
             return StateSpaceFit(likelihood, begun)
-        options = {"processes": None, "cautious": True, **self.options}
-        return self._state_space(likelihood.problem, part=StateSpaceFit(likelihood, begun), **options)
+        return self._state_space(likelihood.problem, part=StateSpaceFit(likelihood, begun))
 
     def _begun(self, move: _Move, smooth: bool, processes: Sequence[str]) -> tuple[Likelihood, Array]:
         """Return the likelihood of a move's model, without a field if `smooth`, with colour as given, and where it begins."""
@@ -246,6 +245,8 @@ class ModelSearch:
         return likelihood, likelihood.coordinates(values)
 
     def _state_space(self, problem: Problem, **choice: Any) -> StateSpaceFit:
+        """Return a fit with the options of every fit, and with a `choice` of others."""
+        choice = {"cautious": True, **choice, **self.options}
         return fit_state_space(problem, close=NEAR, rtol=SEARCH_RTOL, progress=self.progress, **choice)
 
     def _problem(self, hypothesis: Hypothesis, at: Mapping[str, float]) -> Problem:
@@ -410,12 +411,12 @@ class ModelSearch:
         close = [f for f in self.ranked() if f is best or (f.passes and best.evidence - f.evidence < CLOSE)][:MOST_FOLLOWED]
         parts = {f.name: f for f in (*close, self.baseline)}
         self.experiment, fitted = self.whole, {}
-        options = {"processes": None, "cautious": True, **self.options}
+        processes: Sequence[str] | None = None
         for node in parts.values():
             self.progress(f"{node.name}: all readings")
-            found = self._state_space(self._problem(node.hypothesis, node.fit.values), part=node.fit, **options)
+            found = self._state_space(self._problem(node.hypothesis, node.fit.values), part=node.fit, processes=processes)
             fitted[node.name] = replace(self._judged(node.hypothesis, found), scores=node.scores)
-            options["processes"] = found.likelihood.processes
+            processes = found.likelihood.processes
         self.fitted = fitted
         self._grant_shared_field()
 
@@ -637,8 +638,8 @@ class ModelSearch:
             replace(e, vary=(*e.vary, GAUGE_NOISE), by=e.by if e.vary else "run") for e in (self.experiment, self.whole)
         )
         problem = base.hypothesis.problem(self.registry, experiment, at=base.fit.values, trend=self.trend)
-        options = {**self.options, "processes": base.fit.likelihood.processes}
-        found = self._state_space(problem, start=_followable(base.fit.values, problem), **options)
+        start = _followable(base.fit.values, problem)
+        found = self._state_space(problem, start=start, processes=base.fit.likelihood.processes)
         loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
         if loud or log_evidence(found) < log_evidence(base.fit) + CLOSE:
             return base
@@ -651,8 +652,7 @@ class ModelSearch:
         No effect promises to explain then why innovations are correlated.
         """
         if best.against == (CORRELATED,):
-            options = {"processes": None, "cautious": False, **self.options}
-            found = self._state_space(best.fit.likelihood.problem, part=best.fit, **options)
+            found = self._state_space(best.fit.likelihood.problem, part=best.fit, cautious=False)
             self._record(self._judged(best.hypothesis, found))
 
     def _try_rivals(self, best: Fitted) -> None:
