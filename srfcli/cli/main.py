@@ -45,9 +45,12 @@ COMMANDS = {
         "Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment discriminates "
         "between them.",
     ),
-    "new": ("srfcli.cli.new:command", "Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take."),
+    "new": (
+        "srfcli.cli.recordings:new",
+        "Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take.",
+    ),
     "check": (
-        "srfcli.cli.check:command",
+        "srfcli.cli.recordings:check",
         "Read and validate an experiment and report sampling, defects and noise of its recordings.",
     ),
     "fit": (

@@ -1,16 +1,18 @@
-"""`srf new`: from a table of recorded numbers to an experiment.toml that the other commands take."""
+"""`srf new`: from a table of recorded numbers to an experiment.toml; `srf check`: what recordings hold and can tell."""
 
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from srfcli.cli.base import Session, SrfCommand
-from srfcli.cli.options import PATH, plugins_option, reader_option
-from srfcli.core.errors import SrfError
+from srfcli.cli.base import EXIT_CONDITION, EXIT_OK, Session, SrfCommand
+from srfcli.cli.emit import Progress, emit
+from srfcli.cli.options import PATH, OutputOptions, open_registry, output_options, plugins_option, reader_option
+from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import check_target, write_atomic
 from srfcli.core.units import parse_quantity, split_quantity
 
@@ -18,17 +20,24 @@ if TYPE_CHECKING:
     from srfcli.data.draft import Wish
     from srfcli.laws.registry import Registry
 
-EXAMPLES = """
+NEW = """
 srf new run1.csv --stiffness '5.4e-3 1/um'             friction per micron, as rock labs state it
 srf new run1.csv run2.csv --stiffness '55 MPa/mm'      one experiment, two runs
 srf new shs.csv --kind shs --stiffness '1.2e-3 1/um' --window 100,900
 srf new a.txt --column 'shear_stress=S [kPa]' --drive '60:3, 60:10' --load '20 MPa' --stiffness '55 MPa/mm'
 srf new run1.csv --stiffness '5.4e-3 1/um' && srf check . && srf fit .
 """
+CHECK = """
+srf check experiment/                              sampling, flaws, noise, drive and load of every run
+srf check experiment/ --plot check.svg             the runs as figures, flagged samples marked
+srf check experiment/ --no-simulate                check the files only, without simulation
+srf check experiment/ --fail-on gap --fail-on reset && srf fit experiment/
+srf check experiment/ --json | jq .meta.runs       all that was found
+"""
 KINDS = ("steps", "shs", "oscillation")
 
 
-@click.command("new", cls=SrfCommand, epilog=EXAMPLES)
+@click.command("new", cls=SrfCommand, epilog=NEW)
 @click.argument("files", metavar="DATA...", nargs=-1, required=True, type=PATH)
 @click.option("--stiffness", metavar="K", help="Of the machine: '0.21 N/um', '55 MPa/mm', '5e-3 1/um' (friction per um).")
 @click.option(
@@ -53,7 +62,7 @@ KINDS = ("steps", "shs", "oscillation")
 @click.option("--out", metavar="FILE", help="The file to write; - is stdout.  [default: experiment.toml in this folder]")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
 @plugins_option
-def command(files: tuple[Path, ...], out: str | None, force: bool, plugins: tuple[Path, ...], **options: Any) -> None:
+def new(files: tuple[Path, ...], out: str | None, force: bool, plugins: tuple[Path, ...], **options: Any) -> None:
     """Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take.
 
     Columns are recognised by heading and unit; time, what was imposed and what was observed are found in the data. What no table
@@ -175,3 +184,57 @@ def _window(text: str | None) -> tuple[float, float] | None:
         raise SrfError(f"--window {text!r} is not FROM,TO", "As in --window 100,900, in s of the file's own clock.")
     begin, end = (parse_quantity(part, "s", name="--window") for part in parts)
     return begin, end
+
+
+@click.command("check", cls=SrfCommand, epilog=CHECK)
+@click.argument("experiment", type=PATH)
+@click.option("--run", "runs", multiple=True, metavar="NAME", help="Report this run only; may be given several times.")
+@click.option("--format", metavar="NAME", help="Reader of all data files; srf laws --kind reader lists them.")
+@click.option(
+    "--fail-on", multiple=True, metavar="KIND", help="Exit with 4 if there is a notice of this kind; `notice` is any of them."
+)
+@click.option(
+    "--limit",
+    type=click.FloatRange(0, min_open=True),
+    default=512.0,
+    metavar="MB",
+    help="Largest recording that is held in memory.",
+)
+@click.option(
+    "--simulate/--no-simulate", default=True, help="Simulate each run to compute the Cramer-Rao bounds of alpha, lambda and n."
+)
+@plugins_option
+@output_options
+def check(
+    experiment: Path,
+    runs: tuple[str, ...],
+    format: str | None,
+    fail_on: tuple[str, ...],
+    limit: float,
+    simulate: bool,
+    plugins: tuple[Path, ...],
+    output: OutputOptions,
+) -> int:
+    """Read and validate an experiment and report sampling, defects and noise of its recordings.
+
+    Every value of the description is checked against the laws and the data files. For each run: sampling, gaps, spikes, resets,
+    quantisation, level and colour of the noise, drive and load as they are in the data, and what the load's variation can tell.
+    """
+    from srfcli.data.experiment import NOTICE_KINDS, read_experiment
+    from srfcli.tasks import recordings as tasks
+
+    for kind in fail_on:
+        if kind not in NOTICE_KINDS and kind != "notice":
+            raise SrfError(f"--fail-on {kind}: no such kind of notice", did_you_mean(kind, (*NOTICE_KINDS, "notice")))
+    begun, registry = time.perf_counter(), open_registry(plugins)
+    read = read_experiment(experiment, registry=registry, format=format, limit=int(limit * 2**20))
+    with Progress("check", total=len(read.named(runs))) as progress:
+        found = tasks.check(
+            read, runs=runs, simulate=simulate, registry=registry, progress=lambda name: progress.advance(note=name)
+        )
+    table, *more = found.pages if output.format == "text" else (found.table,)
+    inputs = [read.path, *dict.fromkeys(one.run.file for one in found.runs)]
+    emit(table, output, more=more, figure=found.plot, inputs=inputs, timings={"check": time.perf_counter() - begun})
+    kinds = found.notice_kinds
+    failed = bool(kinds) if "notice" in fail_on else bool(kinds & set(fail_on))
+    return EXIT_CONDITION if failed else EXIT_OK
