@@ -505,3 +505,22 @@ def test_a_stiffness_per_stress_beside_forces_needs_the_area(stress: bool, stiff
     done = srf("new", "run1.csv", "--stiffness", stiffness, code=2)
     assert "the stiffness is in" in done.stderr and "area" in done.stderr
     assert not Path("experiment.toml").exists()
+
+
+@pytest.mark.parametrize(
+    "stiffness", [("40 MPa/mm",), ("40 MPa/mm", "--area", "25 cm^2"), ("100 kN/mm", "--area", "25 cm^2"), ("2e-3 1/um",)], ids=" ".join
+)
+def test_what_is_written_of_stresses_is_read_again(stiffness: tuple[str, ...], step: dict[str, np.ndarray]) -> None:
+    """A simulated and an augmented experiment state the stiffness as a stress per length, where stresses are recorded."""
+    headings = ["time [s]", "LP Disp [um]", "Shear stress [MPa]", "Normal stress [MPa]"]
+    table(headings, [step["t"], step["x"], SIGMA * step["mu"], step["sigma"]])
+    srf("new", "run1.csv", "--stiffness", *stiffness)
+    srf("simulate", ".", "--out-dir", "simulated")
+    written = ["simulated"]
+    if len(stiffness) == 1:  # a diagnosis takes seconds
+        srf("diagnose", ".", "--effect", "viscous-drag", "--out", "found")
+        written.append("found/augmented")
+    stated = srfcli.read_experiment(".").stiffness
+    for folder in written:
+        srf("check", "--no-simulate", folder)
+        assert srfcli.read_experiment(folder).stiffness == pytest.approx(stated, rel=1e-12)

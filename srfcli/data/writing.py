@@ -118,7 +118,7 @@ def observables(run: Run) -> list[str]:
 def _description(experiment: Experiment, files: list[str]) -> str:
     choice = experiment.choice
     head = {"format": "srf-experiment/1", "title": experiment.title}
-    apparatus = {"stiffness": experiment.stiffness_text}
+    apparatus = {"stiffness": as_recorded(experiment.stiffness_text, experiment)}
     if experiment.mass:
         apparatus["mass"] = f"{shortest(experiment.mass, KILOGRAM)!r} kg"
     model = {"law": choice.law, "ageing": choice.ageing, "interface": choice.interface, "inertia": choice.inertia}
@@ -177,6 +177,11 @@ def drive_steps(drive: Drive, t: np.ndarray) -> list[tuple[float, float]]:
 def stiffness_text(K: float) -> str:
     """Return a stiffness in N/um as experiment.toml says it."""
     return f"{shortest(K, 1.0)!r} N/um"
+
+
+def as_recorded(text: str, experiment: Experiment) -> str:
+    """Return a stiffness in N/um as one in MPa/um where stresses are recorded, beside which a force would be refused."""
+    return text.replace(" N/um", " MPa/um") if experiment.stress else text
 
 
 def shortest(value: float, factor: float, *, slack: float = 0.0) -> float:

@@ -23,7 +23,7 @@ from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base
 from srfcli.data.description import GEOMETRY, open_node
 from srfcli.data.values import Experiment, ModelChoice
-from srfcli.data.writing import DESCRIPTION, KILOGRAM, parameter_table, shortest
+from srfcli.data.writing import DESCRIPTION, KILOGRAM, as_recorded, parameter_table, shortest
 from srfcli.diagnosis.hypotheses import Hypothesis
 from srfcli.inference.state_space import StateSpaceFit
 from srfcli.laws.effect_file import formula_text
@@ -87,8 +87,7 @@ def augment(
     title = experiment.title + (f" (augmented with {', '.join(hypothesis.reported)})" if hypothesis.reported else " (fitted)")
     text = experiment.stiffness_text if "K" not in values else f"{shortest(K, 1.0)!r} {base}"
     rig = {key: description["apparatus"][key] for key in GEOMETRY if key in description["apparatus"]}
-    text = text.replace(" N/um", " MPa/um") if "area" in rig else text  # beside an area a force would be divided by it
-    rig |= {"stiffness": text} | ({"mass": f"{shortest(mass, KILOGRAM)!r} kg"} if mass else {})
+    rig |= {"stiffness": as_recorded(text, experiment)} | ({"mass": f"{shortest(mass, KILOGRAM)!r} kg"} if mass else {})
     model: dict[str, object] = {"law" if kind == "friction" else kind: f"{kind}.toml" for kind in LAW_KINDS}
     model |= {"inertia": inertia} | ({"effects": effects} if effects else {})
     model |= {"vary": experiment.vary, "by": experiment.by} if experiment.vary else {}
