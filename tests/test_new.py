@@ -508,7 +508,9 @@ def test_a_stiffness_per_stress_beside_forces_needs_the_area(stress: bool, stiff
 
 
 @pytest.mark.parametrize(
-    "stiffness", [("40 MPa/mm",), ("40 MPa/mm", "--area", "25 cm^2"), ("100 kN/mm", "--area", "25 cm^2"), ("2e-3 1/um",)], ids=" ".join
+    "stiffness",
+    [("40 MPa/mm",), ("40 MPa/mm", "--area", "25 cm^2"), ("100 kN/mm", "--area", "25 cm^2"), ("2e-3 1/um",)],
+    ids=" ".join,
 )
 def test_what_is_written_of_stresses_is_read_again(stiffness: tuple[str, ...], step: dict[str, np.ndarray]) -> None:
     """A simulated and an augmented experiment state the stiffness as a stress per length, where stresses are recorded."""

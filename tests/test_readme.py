@@ -39,7 +39,7 @@ class Example:
 def examples(path: Path) -> list[Example]:
     """Return the examples of a document in their order, from its ```console blocks."""
     found: list[Example] = []
-    blocks = re.findall(r"((?:^<!-- .* -->\n)*)^ *```console\n(.*?)^ *```", path.read_text(encoding="utf-8"), re.M | re.S)
+    blocks = re.findall(r"((?:^<!-- [^\n]* -->\n)*)^ *```console\n(.*?)^ *```", path.read_text(encoding="utf-8"), re.M | re.S)
     for marks, block in blocks:
         begun = False
         digits = re.search(r"<!-- digits: (\d+) -->", marks)
@@ -163,6 +163,13 @@ def test_commands_print_what_is_shown(
         assert "Traceback" not in done.stderr
         fault = missing(example.shown, done.stdout.splitlines(), example.rtol)
         assert fault is None, f"{path.name}: $ {example.command}\n{fault}"
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
+def test_every_prompt_is_an_example(path: Path) -> None:
+    """What stands behind a prompt is run, whatever block it stands in."""
+    text = path.read_text(encoding="utf-8")
+    assert [e.command for e in examples(path)] == re.findall(r"^ *\$ (.*)$", text, re.M)
 
 
 def test_commands_see_no_library_that_readme_does_not_install(environment: dict[str, str]) -> None:
