@@ -16,7 +16,7 @@ from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment, FitParameter, ModelChoice
 from srfcli.diagnosis import augment as augmenting
-from srfcli.diagnosis.augment import Folded, augment, fold, law_files
+from srfcli.diagnosis.augment import MergedLaws, augment, law_files, merge
 from srfcli.diagnosis.hypotheses import Hypothesis
 from srfcli.laws.registry import load_registry
 from srfcli.laws.values import Effect
@@ -33,8 +33,8 @@ def effects(*names: str) -> list[Effect]:
     return [e for e in found if isinstance(e, Effect)]
 
 
-def folded(choice: ModelChoice, names: tuple[str, ...], folder: Path, values: dict[str, float] | None = None) -> Folded:
-    laws = fold(REGISTRY, choice, effects(*names))
+def merged(choice: ModelChoice, names: tuple[str, ...], folder: Path, values: dict[str, float] | None = None) -> MergedLaws:
+    laws = merge(REGISTRY, choice, effects(*names))
     for name, text in law_files(laws, values or {}).items():
         (folder / name).write_text(text, encoding="utf-8")
     return laws
@@ -64,7 +64,7 @@ def rates(names: dict[str, Any]) -> tuple[dict[str, sp.Expr], dict[str, float]]:
     ids=lambda v: "+".join(v) if isinstance(v, tuple) else v.law,
 )
 def test_law_files_say_what_the_effects_said(choice: ModelChoice, names: tuple[str, ...], tmp_path: Path) -> None:
-    laws = folded(choice, names, tmp_path)
+    laws = merged(choice, names, tmp_path)
     assert laws.left == ()
     settings = dict(s for e in effects(*names) for s in e.settings)
     chosen = {"law": choice.law, "ageing": choice.ageing, "interface": choice.interface, "inertia": choice.inertia}
@@ -97,11 +97,11 @@ def test_law_files_say_what_the_effects_said(choice: ModelChoice, names: tuple[s
     ],
 )  # fmt: skip
 def test_what_laws_cannot_say_stays_beside_them(choice: ModelChoice, names: tuple[str, ...], left: tuple[str, ...]) -> None:
-    assert tuple(e.name for e in fold(REGISTRY, choice, effects(*names)).left) == left
+    assert tuple(e.name for e in merge(REGISTRY, choice, effects(*names)).left) == left
 
 
 def test_law_files_have_the_fitted_values_within_the_laws_bounds(tmp_path: Path) -> None:
-    folded(PMMA, ("linker-dieterich",), tmp_path, {"A": 0.0131, "B": 1.5, "alpha": 0.02})
+    merged(PMMA, ("linker-dieterich",), tmp_path, {"A": 0.0131, "B": 1.5, "alpha": 0.02})
     law = REGISTRY.get("friction", str(tmp_path / "friction.toml"))
     defaults = {p.name: p.default for p in law.parameters}
     assert (defaults["A"], defaults["B"], defaults["D0"]) == (0.0131, 1.0, 0.402)
@@ -160,7 +160,7 @@ def test_stiffness_and_mass_go_into_the_apparatus(experiment: Experiment, tmp_pa
     again, found = written(experiment, ("stiffness-error",), fit, tmp_path / "new")
     assert again.stiffness_text == "0.25 N/um" and again.runs[0].stiffness == 0.25
     assert again.mass == pytest.approx(3e-6) and again.notices == ()
-    assert found.apparatus == (0.25, pytest.approx(3.0))
+    assert found.system == ("--K", "0.25 N/um", "--M", "3 kg")
 
 
 def test_effects_beside_the_laws_keep_names_that_read_back(experiment: Experiment, tmp_path: Path) -> None:
@@ -170,6 +170,7 @@ def test_effects_beside_the_laws_keep_names_that_read_back(experiment: Experimen
     )  # fmt: skip
     again, found = written(experiment, names, fit, tmp_path / "new")
     assert found.left == again.choice.effects == ("tangential-crosstalk",)
+    assert found.options("here").endswith("--K '0.21 N/um' --M '2.37 kg' --effect tangential-crosstalk --set share=0.01")
     assert {q.name: q.value for q in again.parameters if "share" in q.name} == {"slip_evolution_share": 0.2, "share": 0.01}
 
 

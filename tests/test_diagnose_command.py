@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -174,22 +176,22 @@ def test_other_commands_accept_the_augmented_experiment(found: dict[str, Any], f
     assert srf("simulate", folder / "augmented", "--run", "loadstep", "--csv").stdout.count("\n") == 301
 
 
-def test_the_diagram_of_the_augmented_model_is_one_command_away(folder: Path) -> None:
-    laws = [x for k in ("law", "ageing", "interface") for x in (f"--{k}", folder / "augmented" / f"{k}.toml")]
-    laws[1] = folder / "augmented" / "friction.toml"
-    rows = json.loads(srf("linear", *laws, "--K", 1.0, "--over", "V=5:20:2", "--json").stdout)["rows"]
-    assert all(r["status"] == "ok" for r in rows)
-    plain = json.loads(srf("linear", "--K", 1.0, "--over", "V=5:20:2", "--json").stdout)["rows"]
-    assert rows[0]["W0"] == pytest.approx(plain[0]["W0"], rel=0.1)  # the same physics under constant load, fitted numbers
-
-
-def test_a_reader_gets_a_sentence_and_tables(experiment: Path, found: dict[str, Any]) -> None:
-    text = srf("diagnose", experiment, *EFFECTS, "--seed", 0).stdout
+def test_a_reader_gets_a_sentence_tables_and_what_to_type_next(
+    experiment: Path, found: dict[str, Any], tmp_path: Path, without_figures: None
+) -> None:
+    text = srf("diagnose", experiment, *EFFECTS, "--seed", 0, "--out", tmp_path / "found").stdout
     assert text.startswith("identified: linker-dieterich\n")
     for word in ("hypotheses", "parameters", "runs", "held out", "alpha", "rms over noise"):
         assert word in text
     for parameter in found["augmented"]["parameters"].values():
         assert f"{parameter['value']:.12g}" in text  # nothing is random without a seed
+    (command,) = re.findall(r"^Its stability: srf (linear --law .*)$", text, re.M)
+    words = shlex.split(command)
+    assert words[words.index("--K") + 1] == f"{srfcli.read_experiment(tmp_path / 'found' / 'augmented').stiffness:.6g} N/um"
+    rows = json.loads(srf(*words, "--over", "V=5:20:2", "--json").stdout)["rows"]
+    assert all(r["status"] == "ok" for r in rows)
+    plain = json.loads(srf("linear", "--K", 1.0, "--over", "V=5:20:2", "--json").stdout)["rows"]
+    assert rows[0]["W0"] == pytest.approx(plain[0]["W0"], rel=0.1)  # the same physics under constant load, fitted numbers
 
 
 def test_a_diagnosis_is_replaced_on_demand_only_and_nothing_else_ever(folder: Path, experiment: Path, tmp_path: Path) -> None:

@@ -484,13 +484,12 @@ def test_the_residual_scan_is_read_in_the_order_of_its_p_values() -> None:
     assert load.place.replace("\u00a0", " ") == "58.0 to 72.0 MPa"
 
 
-def test_command_lines_are_quoted_and_name_the_laws_that_there_are() -> None:
-    files = ["my model/experiment.toml", "my model/friction.toml"]
-    lines = command_lines({"model": "my model/experiment.toml"}, files)
+def test_command_lines_are_quoted_and_take_the_whole_model() -> None:
+    lines = command_lines({"model": "my model/experiment.toml"}, "--law 'my model/friction.toml' --K '0.2 N/um'")
     assert lines[0] == "srf check 'my model'"
-    assert [x for x in lines if x.startswith("srf linear")] == ["srf linear --law 'my model/friction.toml'"]
-    assert not any("--ageing" in x for x in lines)
-    assert command_lines({"model": None}, files) == []
+    assert [x for x in lines if x.startswith("srf linear")] == ["srf linear --law 'my model/friction.toml' --K '0.2 N/um'"]
+    assert not any(x.startswith("srf linear") for x in command_lines({"model": "my model/experiment.toml"}, ""))
+    assert command_lines({"model": None}, "") == []
 
 
 def test_text_is_escaped_unless_it_is_markup() -> None:

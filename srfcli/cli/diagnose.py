@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,7 @@ def diagnose(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], 
                 exit_code=EXIT_INTERRUPTED,
             ) from None
     if folder is not None:
-        found.write(folder, force=options["force"], arguments=session.arguments, told=session.say, debug=session.debug)
+        system = found.write(folder, force=options["force"], arguments=session.arguments, told=session.say, debug=session.debug)
         session.say(f"Wrote {folder}")
     if options["as_json"]:
         click.echo(json_text(found.answer, indent=2))
@@ -78,10 +79,8 @@ def diagnose(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], 
             show(table)
             click.echo()
         if folder is not None:
-            home = folder / "augmented"
-            laws = f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
-            click.echo(f"The augmented model: srf fit {home}")
-            click.echo(f"Its laws' diagram: srf linear {laws}")
+            click.echo(f"The augmented model: srf fit {shlex.quote(str(folder / 'augmented'))}")
+            click.echo(f"Its stability: srf linear {system}")
     fitted = ", ".join(sorted(f.name for f in found.diagnosis.ranked))
     finish(
         found.status, advice=f"the answer rests on what was fitted until then: {fitted}. Effects not among these were not tried."

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from srfcli.core.files import toml_lines, unused_name
 from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base
 from srfcli.data.description import GEOMETRY, open_node
-from srfcli.data.values import Experiment, ModelChoice
+from srfcli.data.values import Experiment, FitParameter, ModelChoice
 from srfcli.data.writing import DESCRIPTION, KILOGRAM, as_recorded, parameter_table, shortest
 from srfcli.diagnosis.hypotheses import Hypothesis
 from srfcli.inference.state_space import StateSpaceFit
@@ -31,25 +32,31 @@ from srfcli.laws.expression import parse_expression, symbol
 from srfcli.laws.law_file import FORMAT, known_symbols
 from srfcli.laws.registry import Registry, bundled_folder
 from srfcli.laws.values import AgeingLaw, Effect, FrictionLaw, Interface, Law, State
-from srfcli.symbolic.system import apart
+from srfcli.symbolic.system import apart, without_part
 
 # The augmented model as an experiment that every other command accepts: fitted laws, effects, the same recordings.
 
 COPIED_BYTES = 256 * 2**20  # bytes of recordings that are copied; larger ones stay where they are, and are named from there
 LAW_KINDS = ("friction", "ageing", "interface")
+LAW_OPTIONS = (("--law", "friction.toml"), ("--ageing", "ageing.toml"), ("--interface", "interface.toml"))
 
 
 @dataclass(frozen=True)
 class Augmented:
     """An experiment to be written: `files` (name -> text), `copies` (name -> data file), what `left` is beside the laws.
 
-    `apparatus` is K in N/um (1/um where the stated one is) and M in kg, None without a mass.
+    `system` are options of `srf linear` and its like for what no file of laws has: stiffness, mass, effects beside the laws.
     """
 
     files: Mapping[str, str]
     copies: Mapping[str, Path]
     left: tuple[str, ...]
-    apparatus: tuple[float, float | None]
+    system: tuple[str, ...]
+
+    def options(self, folder: Path | str) -> str:
+        """Return the options by which `srf linear` and its like take the model, its files in `folder`, quoted for a shell."""
+        laws = [(flag, file) for flag, file in LAW_OPTIONS if file in self.files]
+        return shlex.join([*(x for flag, file in laws for x in (flag, (Path(folder) / file).as_posix())), *self.system])
 
 
 def augment(
@@ -67,7 +74,7 @@ def augment(
     was read, if the user named one.
     """
     experiment = hypothesis.experiment(experiment)
-    laws = fold(registry, experiment.choice, hypothesis.effects)
+    laws = merge(registry, experiment.choice, hypothesis.effects)
     renamed = _final_names(registry, experiment, hypothesis, laws)
     listed = [
         replace(q, name=renamed.get(q.name, q.name), value=float(np.clip(fitted.values.get(q.name, q.value), q.lower, q.upper)))
@@ -101,10 +108,27 @@ def augment(
         lines += ["", heading, *toml_lines(table)]
     files = {DESCRIPTION: "\n".join(lines) + "\n", **law_files(laws, values)}
     files |= {name: path.read_text(encoding="utf-8") for name, path in sources.items()}
-    return Augmented(files, copies, tuple(e.name for e in laws.left), (K, mass / KILOGRAM if mass else None))
+    return Augmented(
+        files, copies, tuple(e.name for e in laws.left), _system(experiment, K, mass if inertia else None, laws.left, listed)
+    )
 
 
-def _final_names(registry: Registry, experiment: Experiment, hypothesis: Hypothesis, laws: Folded) -> dict[str, str]:
+def _system(
+    experiment: Experiment, K: float, mass: float | None, left: Sequence[Effect], listed: Sequence[FitParameter]
+) -> tuple[str, ...]:
+    """Return stiffness, mass and effects beside the laws as options; a stiffness in 1/um is that under the first run's load."""
+    unit, load = "MPa/um" if experiment.stress else "N/um", experiment.runs[0].first_load if experiment.per_load else 1.0
+    words = ["--K", f"{K * load:.6g} {unit}", *(("--M", f"{mass / KILOGRAM:.6g} kg") if mass else ("--no-inertia",))]
+    beside = [named for own, named in zip(left, apart(left), strict=True) if not without_part(own)]
+    own_names = {p.name for e in beside for p in e.parameters}
+    words += [word for e in beside for word in ("--effect", e.name)]
+    for q in listed:
+        if q.name in own_names:
+            words += ["--set", f"{q.name}={from_base(q.value, q.unit):.6g}" + (f" {q.unit}" if q.unit != "1" else "")]
+    return tuple(words)
+
+
+def _final_names(registry: Registry, experiment: Experiment, hypothesis: Hypothesis, laws: MergedLaws) -> dict[str, str]:
     """Return the names that parameters of effects beside the laws have now that some effects are no longer among them."""
     own = [registry.get("effect", name) for name in experiment.choice.effects]
     every = [e for e in (*own, *hypothesis.effects) if isinstance(e, Effect)]
@@ -156,7 +180,7 @@ KIND_OF_SLOT = {"mu": "friction", "rate": "ageing", "kappa": "interface"}
 
 
 @dataclass(frozen=True)
-class Folded:
+class MergedLaws:
     """The laws with what could be written into them; `left` are the effects that stay beside them, as they are registered."""
 
     friction: FrictionLaw
@@ -174,7 +198,7 @@ class Folded:
         return {"mu": self.friction.mu, "rate": self.ageing.rate, "kappa": self.interface.kappa}[slot]
 
 
-def fold(registry: Registry, choice: ModelChoice, effects: Sequence[Effect]) -> Folded:
+def merge(registry: Registry, choice: ModelChoice, effects: Sequence[Effect]) -> MergedLaws:
     """Return the laws of `choice` with its own effects and `effects` written into them as far as that can be done exactly."""
     chosen = {key: value for e in effects for key, value in e.settings}
     base, modifiers = registry.ageing(choice.ageing)
@@ -183,12 +207,12 @@ def fold(registry: Registry, choice: ModelChoice, effects: Sequence[Effect]) -> 
     friction = registry.get("friction", choice.law)
     interface = registry.get("interface", str(chosen.get("interface", choice.interface)))
     assert isinstance(friction, FrictionLaw) and isinstance(interface, Interface)
-    found = Folded(friction, ageing, interface, changed=frozenset({"ageing"} if modifiers else ()))
+    found = MergedLaws(friction, ageing, interface, changed=frozenset({"ageing"} if modifiers else ()))
     every = [*(_effect(registry, name) for name in choice.effects), *effects]
     pairs = [(own, named) for own, named in zip(every, apart(every), strict=True) if named.changes or named.states]
     stays: list[Effect] = []
     for own, named in sorted(pairs, key=lambda p: all(slot != "rate" for slot, _ in p[1].changes)):
-        new = None if own.name in choice.effects else _folded(found, named, stays)
+        new = None if own.name in choice.effects else _merged(found, named, stays)
         if new is None:
             stays.append(named)
             found = replace(found, left=(*found.left, own))
@@ -204,7 +228,7 @@ def _effect(registry: Registry, name: str) -> Effect:
     return effect
 
 
-def _folded(laws: Folded, effect: Effect, stays: Sequence[Effect]) -> Folded | None:
+def _merged(laws: MergedLaws, effect: Effect, stays: Sequence[Effect]) -> MergedLaws | None:
     """Return the laws with an effect, whose parameters have their final names; None where their language cannot say it."""
     if not effect.constitutive or len(effect.changes) != 1 or effect.observed:
         return None
@@ -241,7 +265,7 @@ def _commute(slot: str, formula: sp.Expr, other: Effect) -> bool:
     return True
 
 
-def _states(laws: Folded, effect: Effect) -> tuple[State, ...] | None:
+def _states(laws: MergedLaws, effect: Effect) -> tuple[State, ...] | None:
     """Return an effect's unknowns as states of the friction law; None unless the ageing law itself rules them."""
     found = []
     names = [p.name for p in effect.parameters]
@@ -270,7 +294,7 @@ def _sayable(formula: sp.Expr, known: Sequence[str]) -> bool:
     return abs(one - other) <= 1e-12 * (1 + abs(one))
 
 
-def law_files(laws: Folded, values: Mapping[str, float]) -> dict[str, str]:
+def law_files(laws: MergedLaws, values: Mapping[str, float]) -> dict[str, str]:
     """Return friction.toml, ageing.toml and interface.toml; `values`, in um, s, N, are their parameters' defaults."""
     out = {}
     for slot, kind in KIND_OF_SLOT.items():

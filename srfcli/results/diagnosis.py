@@ -259,7 +259,7 @@ class DiagnosisResult(Result):
         arguments: Sequence[str] = (),
         told: Callable[[str], None] = lambda text: None,
         debug: bool = False,
-    ) -> None:
+    ) -> str:
         """Write answer, predictions, report, figures and the augmented experiment to a folder, whole or not at all.
 
         Parameters
@@ -272,6 +272,11 @@ class DiagnosisResult(Result):
             Told what could not be made, such as a report without Matplotlib.
         debug : bool
             Whether an error in the report is raised.
+
+        Returns
+        -------
+        str
+            Options by which `srf linear`, `continue`, `map` and `floquet` take the augmented model.
 
         Raises
         ------
@@ -301,7 +306,7 @@ class DiagnosisResult(Result):
                 write_atomic(fresh / "augmented" / name, content)
             for name, source in augmented.copies.items():
                 shutil.copyfile(source, fresh / "augmented" / name)
-            made_of = dict(self._material)
+            made_of = {**self._material, "system": augmented.options("augmented")}
             diagram = stability(
                 self.registry, diagnosis.experiment, diagnosis.shown.fit.values,
                 replace(as_fitted(last), runs=diagnosis.experiment.runs), augmented.left,
@@ -330,6 +335,7 @@ class DiagnosisResult(Result):
                 if debug:
                     raise
                 told(f"Warning: no report: {type(error).__name__}: {error}")
+        return augmented.options(folder / "augmented")
 
 
 def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:

@@ -404,24 +404,19 @@ def onward(matter: Matter) -> Markup:
     files = [p for pattern in FILES for p in sorted(matter.folder.glob(pattern)) if p.is_file()]
     names = [p.relative_to(matter.folder).as_posix() for p in files]
     items = [tag("li", tag("a", name, href=quote(name))) for name in names]
-    lines = command_lines(matter.answer, names)
+    lines = command_lines(matter.answer, str(matter.material.get("system") or ""))
     parts = [tag("p", "Typed in the folder of this report:"), commands(lines)] if lines else []
     return section("onward", "The model, and how to go on", parts, tag("ul", items) if items else "")
 
 
-def command_lines(answer: Mapping[str, Any], files: Sequence[str]) -> list[str]:
-    """Return commands that take the augmented model, which is complete: its experiment and, where there are any, its laws."""
+def command_lines(answer: Mapping[str, Any], system: str) -> list[str]:
+    """Return commands that take the augmented model; `system` are the options by which commands of stability take it."""
     model = answer.get("model")
     if not model:
         return []
-    folder = Path(str(model)).parent
-    place = shlex.quote(folder.as_posix())
+    place = shlex.quote(Path(str(model)).parent.as_posix())
     found = [f"srf check {place}", f"srf fit {place}", f"srf simulate {place}"]
-    options = [("--law", "friction.toml"), ("--ageing", "ageing.toml"), ("--interface", "interface.toml")]
-    laws = [f"{o} {shlex.quote((folder / f).as_posix())}" for o, f in options if (folder / f).as_posix() in files]
-    if laws:
-        found += [f"srf linear {' '.join(laws)}", f"srf continue {' '.join(laws)} --eps 0.18 --plot diagram.svg"]
-    return found
+    return found + ([f"srf linear {system}", f"srf continue {system} --eps 0.18 --plot diagram.svg"] if system else [])
 
 
 # HTML by small functions: all text is escaped unless it was built here; one page with its style and its pictures inside.
