@@ -99,6 +99,9 @@ def test_a_map_has_two_dimensions(slider: srf.SlidingSystem) -> None:
     assert [list(r) for r in found.table.rows] == rows_of("map", *options)
     assert len(found.components.rows) == 2 and found.status is srf.Status.OK
     pytest.importorskip("xarray")
+    boundary = found.boundary.to_dataframe()
+    assert set(boundary["component"]) == {1, 2} and boundary.attrs["units"]["V"] == "um/s"
+    assert "<table>" in found.components._repr_html_()
     field = found.to_xarray()
     assert field["growth_per_slip"].dims == ("V", "K_over_W0") and field["V"].attrs["units"] == "um/s"
     assert (field["type"].values == "stable").sum() == sum(row[1] == "stable" for row in found.table.rows)
@@ -160,12 +163,12 @@ def test_results_are_frozen_and_have_every_form(linear) -> None:
 
 
 def test_a_notebook_shows_a_table_and_escapes_what_it_shows(linear) -> None:
-    from srfcli.results.tables import ROWS_SHOWN, Column, Table, table_html
+    from srfcli.results.tables import ROWS_SHOWN, Column, Table
 
     page = linear._repr_html_()
     assert page.count("<tr>") == 4 and "W0 [N]" in page
     rows = [("<script>",)] * (ROWS_SHOWN + 3)
-    page = table_html(Table("x/1", (Column("a<b", "", '"'),), rows, "t&t", ("n>1",)))
+    page = Table("x/1", (Column("a<b", "", '"'),), rows, "t&t", ("n>1",))._repr_html_()
     assert "<script" not in page and "3 more rows" in page and "t&amp;t" in page and "n&gt;1" in page
 
 

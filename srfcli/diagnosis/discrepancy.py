@@ -11,7 +11,6 @@ Fixed-interval smoother: de Jong, Biometrika 76 (1989).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -23,6 +22,7 @@ import numpy as np
 import sympy as sp
 
 from srfcli.codegen.model import Array
+from srfcli.core.files import toml_lines
 from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base
 from srfcli.diagnosis.hypotheses import own_parameters
@@ -294,36 +294,34 @@ class ClosedForm:
     def as_toml(self, *, name: str = FORM_NAME) -> str:
         """Return the terms as one effect file, fitted values as defaults."""
         named = self.named()
-        lines = ['format = "srf-law/1"', 'kind = "effect"', f"name = {_text(name)}"]
-        lines.append(f"about = {_text('Found by search, not by theory: ' + '; '.join(e.about for e in named))}")
-        lines += [f"{slot} = {_text(formula_text(f))}" for slot, f in self.formulas().items()]
-        states = [s for e in named for s in e.states]
-        if states:
-            rows = [f"name = {_text(s.name)}, rate = {_text(str(s.rate))}, steady = {_text(str(s.steady))}" for s in states]
-            lines.append("states = [" + ", ".join("{ " + row + " }" for row in rows) + "]")
+        head: dict[str, object] = {"format": "srf-law/1", "kind": "effect", "name": name}
+        head |= {"about": "Found by search, not by theory: " + "; ".join(e.about for e in named)}
+        head |= {slot: formula_text(f) for slot, f in self.formulas().items()}
+        states = [{"name": s.name, "rate": str(s.rate), "steady": str(s.steady)} for e in named for s in e.states]
         needs = list(dict.fromkeys(n for e in named for n in e.needs))
-        if needs:
-            lines.append(f"needs = [{', '.join(map(_text, needs))}]")
-        if not all(e.constitutive for e in named):
-            lines.append("constitutive = false")
-        lines += ["", "[parameters]"]
+        head |= {"states": states} if states else {}
+        head |= {"needs": needs} if needs else {}
+        head |= {} if all(e.constitutive for e in named) else {"constitutive": False}
+        parameters: dict[str, object] = {}
         for term, effect in zip(self.terms, named, strict=True):
-            lines += _parameters(effect, [v for v, _ in term.values.values()])
-        constants = list(dict.fromkeys(c for e in named for c in e.constants))
+            parameters |= _parameters(effect, [v for v, _ in term.values.values()])
+        lines = [*toml_lines(head), "", "[parameters]", *toml_lines(parameters)]
+        constants = {c.name: {"value": c.default, "unit": c.unit} for e in named for c in e.constants}
         if constants:
-            lines += ["", "[constants]"]
-            lines += [f"{c.name} = {{ value = {c.default!r}, unit = {_text(c.unit)} }}" for c in constants]
+            lines += ["", "[constants]", *toml_lines(constants)]
         return "\n".join(lines) + "\n"
 
 
-def _parameters(effect: Effect, values: Sequence[float]) -> list[str]:
-    neutral, scans, lines = dict(effect.neutral), dict(effect.scans), []
-    for p, value in zip(effect.parameters, values, strict=True):
-        cells = [f"default = {min(max(value, p.lower), p.upper)!r}"]
-        cells.append(f"neutral = {neutral[p.name]!r}" if p.name in neutral else f"scan = {scans.get(p.name, SCANNED_VALUES)}")
-        cells += [f"unit = {_text(p.unit)}", f"bounds = [{p.lower!r}, {p.upper!r}]", f"about = {_text(p.about)}"]
-        lines.append(f"{p.name} = {{ {', '.join(cells)} }}")
-    return lines
+def _parameters(effect: Effect, values: Sequence[float]) -> dict[str, object]:
+    neutral, scans = dict(effect.neutral), dict(effect.scans)
+    return {
+        p.name: {
+            "default": min(max(value, p.lower), p.upper),
+            **({"neutral": neutral[p.name]} if p.name in neutral else {"scan": scans.get(p.name, SCANNED_VALUES)}),
+            "unit": p.unit, "bounds": [p.lower, p.upper], "about": p.about,
+        }
+        for p, value in zip(effect.parameters, values, strict=True)
+    }  # fmt: skip
 
 
 def with_error(value: float, error: float) -> str:
@@ -339,7 +337,3 @@ def with_error(value: float, error: float) -> str:
 
 def _unit(unit: str) -> str:
     return "" if unit in ("", "1") else f" {unit}"
-
-
-def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+ROWS_SHOWN = 20  # rows of a table that a notebook shows
 STATUS = "ok, or what keeps the row from being used as it stands"
 
 # A result as a table, and its form for a reader: aligned plain text, or rich on a terminal.
@@ -69,6 +70,68 @@ class Table:
         """Return each row as column name -> cell."""
         names = [c.name for c in self.columns]
         return [dict(zip(names, row, strict=True)) for row in self.rows]
+
+    def to_dataframe(self) -> Any:
+        """Return the table as a pandas.DataFrame; `attrs` holds units, title, notes and status.
+
+        Raises
+        ------
+        SrfError
+            Where pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise SrfError("to_dataframe needs pandas, which is not installed", 'pip install "srfcli[frames]"') from error
+        rows = [[plain_value(v) for v in row] for row in self.rows]
+        frame = pandas.DataFrame(rows, columns=[c.name for c in self.columns])
+        frame.attrs = {
+            "title": self.title,
+            "units": {c.name: c.unit for c in self.columns},
+            "notes": list(self.notes),
+            "status": self.status,
+        }
+        return frame
+
+    def to_xarray(self) -> Any:
+        """Return the table as an xarray.Dataset over its rows; every variable has its unit and meaning in `attrs`.
+
+        Raises
+        ------
+        SrfError
+            Where xarray or pandas is not installed.
+        """
+        xarray, frame = load_xarray(), self.to_dataframe()
+        made = xarray.Dataset({name: ("row", frame[name].to_numpy()) for name in frame.columns})
+        for column in self.columns:
+            made[column.name].attrs = {"units": column.unit, "long_name": column.about}
+        made.attrs = {"title": self.title, "status": self.status}
+        return made
+
+    def __str__(self) -> str:
+        return to_text(self, full=False).rstrip("\n")
+
+    def _repr_html_(self) -> str:
+        """Return the table as HTML for a notebook, its first rows and its notes; all text is escaped."""
+        right = [is_numeric(self, i) for i in range(len(self.columns))]
+
+        def cell(tag: str, index: int, text: str, about: str = "") -> str:
+            side = "right" if right[index] else "left"
+            tip = f' title="{html.escape(about)}"' if about else ""
+            return f'<{tag} style="text-align:{side}"{tip}>{html.escape(text)}</{tag}>'
+
+        head = "".join(cell("th", i, c.heading, c.about) for i, c in enumerate(self.columns))
+        body = [
+            "<tr>" + "".join(cell("td", i, cell_text(v, self.columns[i].format)) for i, v in enumerate(row)) + "</tr>"
+            for row in list(self.rows[:ROWS_SHOWN])
+        ]
+        left = len(self.rows) - len(body)
+        notes = [*([f"{left} more rows"] if left else []), *self.notes]
+        told = "".join(f"<li>{html.escape(note)}</li>" for note in notes)
+        return (
+            f"<div><b>{html.escape(self.title)}</b><table><thead><tr>{head}</tr></thead>"
+            f"<tbody>{''.join(body)}</tbody></table>{f'<ul>{told}</ul>' if told else ''}</div>"
+        )
 
 
 def plain_value(value: Any) -> Any:
@@ -223,8 +286,6 @@ def to_json(table: Table) -> str:
 
 # What every result can do.
 
-ROWS_SHOWN = 20  # rows of a table that a notebook shows
-
 
 class Result(ABC):
     """Result of a task. `table` holds the numbers; data frames, arrays and figures are made from it."""
@@ -279,20 +340,7 @@ class Result(ABC):
         SrfError
             Where pandas is not installed.
         """
-        try:
-            import pandas
-        except ImportError as error:
-            raise SrfError("to_dataframe needs pandas, which is not installed", 'pip install "srfcli[frames]"') from error
-        table = self.table
-        rows = [[plain_value(v) for v in row] for row in table.rows]
-        frame = pandas.DataFrame(rows, columns=[c.name for c in table.columns])
-        frame.attrs = {
-            "title": table.title,
-            "units": {c.name: c.unit for c in table.columns},
-            "notes": list(table.notes),
-            "status": table.status,
-        }
-        return frame
+        return self.table.to_dataframe()
 
     def to_xarray(self) -> Any:
         """Return the table as an xarray.Dataset over its rows; every variable has its unit and meaning in `attrs`.
@@ -302,15 +350,10 @@ class Result(ABC):
         SrfError
             Where xarray or pandas is not installed.
         """
-        xarray, frame = load_xarray(), self.to_dataframe()
-        made = xarray.Dataset({name: ("row", frame[name].to_numpy()) for name in frame.columns})
-        for column in self.table.columns:
-            made[column.name].attrs = {"units": column.unit, "long_name": column.about}
-        made.attrs = {"title": self.table.title, "status": self.table.status}
-        return made
+        return self.table.to_xarray()
 
     def __str__(self) -> str:
-        return to_text(self.table, full=False).rstrip("\n")
+        return str(self.table)
 
     def __repr__(self) -> str:
         count = len(self.table.rows)
@@ -319,30 +362,7 @@ class Result(ABC):
 
     def _repr_html_(self) -> str:
         """Return the table for a notebook: its first rows, and the notes."""
-        return table_html(self.table)
-
-
-def table_html(table: Table) -> str:
-    """Return a table as HTML, its first rows and its notes; all text is escaped."""
-    right = [is_numeric(table, i) for i in range(len(table.columns))]
-
-    def cell(tag: str, index: int, text: str, about: str = "") -> str:
-        side = "right" if right[index] else "left"
-        tip = f' title="{html.escape(about)}"' if about else ""
-        return f'<{tag} style="text-align:{side}"{tip}>{html.escape(text)}</{tag}>'
-
-    head = "".join(cell("th", i, c.heading, c.about) for i, c in enumerate(table.columns))
-    body = [
-        "<tr>" + "".join(cell("td", i, cell_text(v, table.columns[i].format)) for i, v in enumerate(row)) + "</tr>"
-        for row in list(table.rows[:ROWS_SHOWN])
-    ]
-    left = len(table.rows) - len(body)
-    notes = [*([f"{left} more rows"] if left else []), *table.notes]
-    told = "".join(f"<li>{html.escape(note)}</li>" for note in notes)
-    return (
-        f"<div><b>{html.escape(table.title)}</b><table><thead><tr>{head}</tr></thead>"
-        f"<tbody>{''.join(body)}</tbody></table>{f'<ul>{told}</ul>' if told else ''}</div>"
-    )
+        return self.table._repr_html_()
 
 
 def load_xarray() -> Any:
