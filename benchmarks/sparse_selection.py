@@ -85,7 +85,7 @@ def track_columns(found: Rows) -> Array:
     """Return (n, m) a spline over slip that all runs share, whitened as the rows are."""
     spline = Spline.over(float(found.slip.min()), float(found.slip.max()), KNOTS)
     cell, weights = spline.weights(found.slip)
-    T = np.zeros((found.y.size, spline.numbers.size))
+    T = np.zeros((found.y.size, spline.coefficients.size))
     for k in range(4):
         T[np.arange(cell.size), cell + k] = weights[:, k] / found.error
     T = T[:, np.abs(T[~found.held]).sum(axis=0) > 0]

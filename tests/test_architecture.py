@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ import click
 import pytest
 
 from srfcli.cli.main import COMMANDS, cli
+from srfcli.core.errors import SrfError
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "srfcli"
@@ -255,7 +257,7 @@ def test_every_command_is_documented(name: str, command: click.Command) -> None:
         assert not isinstance(option, click.Option) or option.help, f"{name} {option.name}"
     assert f"`{name}`" in (ROOT / "README.md").read_text(encoding="utf-8")
     section = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8").partition(f"\n## `{name}`\n")[2].partition("\n## ")[0]
-    assert f"\n$ {name}" in section or f" {name} " in section, f"docs/cli.md has no section with an example of {name}"
+    assert re.search(rf"^(\$ )?{name} | {name} ", section, re.M), f"docs/cli.md has no section with an example of {name}"
 
 
 @pytest.mark.parametrize(("name", "command"), list(commands()), ids=lambda v: v if isinstance(v, str) else "")
@@ -265,6 +267,37 @@ def test_documented_options_exist(name: str, command: click.Command) -> None:
     known = {o for p in command.params for o in (*p.opts, *p.secondary_opts)} | {"--help"}
     prose = re.sub(r"```.*?```", "", section, flags=re.S)
     assert set(re.findall(r"`(--[\w-]+)", prose)) <= known
+
+
+def shown_commands() -> list[tuple[str, list[str]]]:
+    """Return the commands in the documents' blocks that no test runs, each with its page."""
+    found = []
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        for block in re.findall(r"^```sh\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S):
+            for line in block.replace("\\\n", " ").splitlines():
+                for part in re.split(r" \| | && ", line):
+                    words = shlex.split(part, comments=True)
+                    if words[:1] == ["srf"] and words[1:] != ["--version"]:
+                        found.append((path.name, words[1:]))
+    return found
+
+
+def test_commands_that_are_shown_but_not_run_are_read() -> None:
+    """Names of commands and options exist, and values are of their kind; files need not be there."""
+    shown = shown_commands()
+    assert len(shown) > 10
+    for page, words in shown:
+        command: click.Command = cli
+        while isinstance(command, click.Group):
+            found = command.get_command(click.Context(command), words[0])
+            assert found is not None, f"{page}: srf {words[0]}"
+            command, words = found, words[1:]
+        try:
+            command.make_context(command.name, list(words))
+        except click.UsageError as error:
+            pytest.fail(f"{page}: srf {shlex.join(words)}: {error.message}")
+        except SrfError as error:
+            assert "no such" not in error.message, f"{page}: {error.message}"
 
 
 def test_the_list_of_commands_says_what_they_say() -> None:

@@ -26,7 +26,7 @@ def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.nda
     """A linear problem r = J theta + C c + noise of variance 1 on a track; returns r, J, C and the track."""
     rng = np.random.default_rng(seed)
     track = Spline.over(0.0, 30.0, 0.8)
-    n, m = 400, track.numbers.size
+    n, m = 400, track.coefficients.size
     J, C = rng.normal(size=(n, 2)), 2e4 * track.design(np.linspace(0, 30, n))
     c = FieldPrior(amplitude, LENGTHS[1]).root(track.nodes) @ rng.normal(size=m) if amplitude else np.zeros(m)
     return J @ [1.0, -2.0] + C @ c + rng.normal(size=n), J, C, track
@@ -34,7 +34,7 @@ def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.nda
 
 def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, roughness: FieldPrior) -> float:
     """The log likelihood with parameters and track integrated out, from the covariance of all samples."""
-    L = roughness.root(track.nodes) if roughness.amplitude else np.zeros((track.numbers.size, 1))
+    L = roughness.root(track.nodes) if roughness.amplitude else np.zeros((track.coefficients.size, 1))
     S = np.eye(r.size) + C @ L @ L.T @ C.T
     W = np.linalg.solve(S, np.column_stack([J, r]))
     rest = r - J @ np.linalg.solve(J.T @ W[:, :2], J.T @ W[:, 2])

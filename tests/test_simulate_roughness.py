@@ -73,7 +73,7 @@ def test_covariance_over_many_seeds(length: float) -> None:
 
 def curve(spline: Spline) -> BSpline:
     """Return a table as scipy evaluates it."""
-    return BSpline(spline.first + spline.spacing * np.arange(-3, spline.numbers.size + 1), spline.numbers, 3)
+    return BSpline(spline.first + spline.spacing * np.arange(-3, spline.coefficients.size + 1), spline.coefficients, 3)
 
 
 def test_what_lies_between_knots_is_as_rough_as_it_should_be() -> None:
@@ -104,13 +104,13 @@ def test_a_part_of_a_track_is_the_same_whatever_else_is_asked_for(
     part, whole = track.spline(start, start + span), track.spline(start - more, start + span + more)
     assert part.first <= start and part.last >= start + span and part.spacing <= min(length / 4, WIDEST_KNOTS)
     offset = round((part.first - whole.first) / part.spacing)
-    assert np.array_equal(part.numbers, whole.numbers[offset : offset + part.numbers.size])
+    assert np.array_equal(part.coefficients, whole.coefficients[offset : offset + part.coefficients.size])
 
 
 def test_size_scales_and_seed_changes_a_track() -> None:
     one, two, other = (FrictionField(size, 5.0, seed).spline(-20, 80) for size, seed in ((1e-4, 3), (2e-4, 3), (1e-4, 4)))
-    assert two.numbers == pytest.approx(2 * one.numbers, rel=1e-14)
-    assert abs(np.corrcoef(one.numbers, other.numbers)[0, 1]) < 0.8
+    assert two.coefficients == pytest.approx(2 * one.coefficients, rel=1e-14)
+    assert abs(np.corrcoef(one.coefficients, other.coefficients)[0, 1]) < 0.8
 
 
 @pytest.mark.parametrize("size, length", [(-1e-4, 1.0), (np.nan, 1.0), (np.inf, 1.0), (1e-4, -1.0), (1e-4, np.nan),
@@ -124,7 +124,7 @@ def test_a_track_without_end_is_refused_with_its_size() -> None:
     with pytest.raises(SrfError, match="to position 1e\\+09 um"):
         FrictionField(1e-4, 1.0).spline(0.0, 1e9)
     long = FrictionField(1e-4, 1e6, 2).spline(0.0, 100.0)  # hardly a change over what is slid
-    assert np.ptp(long.numbers) < 1e-6 and np.isfinite(long.numbers).all()
+    assert np.ptp(long.coefficients) < 1e-6 and np.isfinite(long.coefficients).all()
 
 
 # ---- the motion

@@ -22,8 +22,8 @@ TABLES = (("mu", "slip"), ("mu", "time"), ("V", "stage"))
 
 
 def scipy_spline(s: Spline) -> BSpline:
-    knots = s.first + s.spacing * (np.arange(s.numbers.size + 4) - 3)
-    return BSpline(knots, s.numbers, 3)
+    knots = s.first + s.spacing * (np.arange(s.coefficients.size + 4) - 3)
+    return BSpline(knots, s.coefficients, 3)
 
 
 def some(seed: int = 1, *, first: float = -1.5, spacing: float = 0.7, n: int = 12) -> Spline:
@@ -35,7 +35,7 @@ def test_values_are_those_of_scipy(n):
     s = some(n=n)
     x = np.linspace(s.first, s.last, 203)[1:-1]
     assert s(x) == pytest.approx(scipy_spline(s)(x), abs=1e-13)
-    assert s.design(x) @ s.numbers == pytest.approx(scipy_spline(s)(x), abs=1e-13)
+    assert s.design(x) @ s.coefficients == pytest.approx(scipy_spline(s)(x), abs=1e-13)
     assert s.design(x).sum(axis=1) == pytest.approx(1.0, abs=1e-14)
 
 
@@ -80,7 +80,7 @@ def test_complex_steps_see_argument_and_numbers():
     lut, lut1, _ = tables_after(1)
     x = np.linspace(s.first + 0.1, s.last - 0.1, 31)
     assert np.imag(lut(p, 0, x + 1j * step)) / step == pytest.approx(lut1(p, 0, x), abs=1e-12)
-    for k in range(s.numbers.size):
+    for k in range(s.coefficients.size):
         q = p.astype(complex)
         q[int(p[1]) + k] += 1j * step
         assert np.imag(lut(q, 0, x)) / step == pytest.approx(s.design(x)[:, k], abs=1e-14)
@@ -98,11 +98,11 @@ def test_knots_cover_what_is_asked_for(low, width, spacing):
     s = Spline.over(low, low + width, spacing)
     assert s.first == low and s.last == pytest.approx(low + width, rel=1e-12, abs=1e-12)
     assert s.spacing <= spacing * (1 + 1e-12)
-    assert s.numbers.size == round((s.last - s.first) / s.spacing) + 3 and not s.numbers.any()
+    assert s.coefficients.size == round((s.last - s.first) / s.spacing) + 3 and not s.coefficients.any()
     peak = s.nodes[1]  # where its own bump is highest, at the first knot
     assert peak == pytest.approx(s.first)
     assert s.design(np.array([peak]))[0].argmax() == 1
-    line = s.with_numbers(2.0 + 3.0 * s.nodes)  # a spline whose numbers lie on a line is that line
+    line = s.with_coefficients(2.0 + 3.0 * s.nodes)  # a spline whose numbers lie on a line is that line
     x = np.linspace(s.first, s.last, 17)
     assert line(x) == pytest.approx(2 + 3 * x, rel=1e-9, abs=1e-9)
 
@@ -116,9 +116,12 @@ def motion(make_model, tables, *, how="compiled", by_tables=(), by=(), rtol=1e-9
     t = np.linspace(0.0, end, 101)
     drive, load = Drive.steps([(0.0, 20.0), (0.2, 30.0)]), Modulation(6.0, 0.1, 120.0, 0.25)
     start = np.asarray(model.steady(appended(p, tables)))
-    count = len(by) + sum(tables[i].numbers.size for i in by_tables)
+    count = len(by) + sum(tables[i].coefficients.size for i in by_tables)
     S0 = np.zeros((start.size, count))
-    columns = [*by, *(int(appended(p, tables)[len(p) + 4 * i]) + j for i in by_tables for j in range(tables[i].numbers.size))]
+    columns = [
+        *by,
+        *(int(appended(p, tables)[len(p) + 4 * i]) + j for i in by_tables for j in range(tables[i].coefficients.size)),
+    ]
     for k, place in enumerate(columns):
         q = appended(p, tables).astype(complex)
         q[place] += 1e-30j
@@ -136,7 +139,8 @@ def tables_for(size: float = 1.0) -> tuple[Spline, ...]:
     shapes = (Spline.over(0.0, 8.0, 1.0), Spline.over(0.1, 0.4, 0.05), Spline.over(-1.0, 15.0, 2.0))
     rng = np.random.default_rng(6)
     return tuple(
-        s.with_numbers(size * w * rng.standard_normal(s.numbers.size)) for s, w in zip(shapes, (2e-3, 2e-3, 0.05), strict=True)
+        s.with_coefficients(size * w * rng.standard_normal(s.coefficients.size))
+        for s, w in zip(shapes, (2e-3, 2e-3, 0.05), strict=True)
     )
 
 
@@ -169,15 +173,15 @@ def test_flat_tables_and_none_are_the_plain_model(make_model):
 def test_derivatives_by_a_table_s_numbers(make_model, table):
     tables = tables_for()
     found = motion(make_model, tables, by=(2,), by_tables=(table,), rtol=1e-8).S
-    count = tables[table].numbers.size
+    count = tables[table].coefficients.size
     assert found.shape[2] == 1 + count
     step, largest = (1e-4, 1e-4, 1e-3)[table], 0.0
     for k in range(count):
         sides = []
         for sign in (1, -1):
-            numbers = tables[table].numbers.copy()
+            numbers = tables[table].coefficients.copy()
             numbers[k] += sign * step
-            moved = [s.with_numbers(numbers) if i == table else s for i, s in enumerate(tables)]
+            moved = [s.with_coefficients(numbers) if i == table else s for i, s in enumerate(tables)]
             sides.append(motion(make_model, moved, rtol=1e-11).x)
         expected = (sides[0] - sides[1]) / (2 * step)
         scale = np.abs(expected[:, 0]).max()
@@ -193,7 +197,7 @@ def test_derivatives_by_all_tables_stand_in_order(make_model):
     at = 0
     for i, s in enumerate(tables):
         own = motion(make_model, tables, by_tables=(i,)).S
-        n = s.numbers.size
+        n = s.coefficients.size
         assert np.abs(whole[:, :, at : at + n] - own).max() <= 1e-3 * np.abs(own).max()
         at += n
     assert at == whole.shape[2]
@@ -219,7 +223,7 @@ def test_a_prediction_has_columns_for_numbers_after_those_of_parameters(shared, 
     model = make_model(tables=(("mu", "slip"),))
     run = next(r for r in experiment.runs if r.name == "strong")
     track = Spline.over(-1.0, 50.0, 5.0)
-    track = track.with_numbers(1e-3 * np.random.default_rng(2).standard_normal(track.numbers.size))
+    track = track.with_coefficients(1e-3 * np.random.default_rng(2).standard_normal(track.coefficients.size))
     found = predict(model, experiment, run, {}, by=("mu0", "A"), tables=(track,), by_tables=(0,), until=0.9)
-    assert found.J.shape == (found.y.size, 2 + track.numbers.size)
+    assert found.J.shape == (found.y.size, 2 + track.coefficients.size)
     assert found.J[:, 2:].sum(axis=1) == pytest.approx(found.J[:, 0], rel=1e-3, abs=1e-3)  # all numbers together are mu0

@@ -434,7 +434,7 @@ def made(model, seed, amplitude, *, sd=3e-4):
 
         table = Spline.over(-5.0, 400.0, 0.25)
         where = table.nodes
-        table = table.with_numbers(m * np.cos(np.outer(where, waves) + phases).sum(axis=1))
+        table = table.with_coefficients(m * np.cos(np.outer(where, waves) + phases).sum(axis=1))
         p = model.vector(ROCK_VALUES | {"V": 3.0, "W0": 20.0, "K": 0.2})
         from srfcli.codegen.splines import appended
 
@@ -508,7 +508,7 @@ def test_from_far_off_a_score_promises_no_more_than_there_is(make_model):
     whole = maximise(likelihood, likelihood.coordinates({**true, **wide}))
     narrow = {"gauge_white": 0.003, "field_amplitude": 3e-4, "field_length": 1.0}
     far = maximise(likelihood, likelihood.coordinates({**true, "B": 0.03, "D0": 0.35, **narrow}), steps=1, widths=())
-    assert far.point.log_likelihood + far.away**2 / 2 > 100 * whole.point.log_likelihood > 100 * far.promised
+    assert far.point.log_likelihood + far.away**2 / 2 > 100 * whole.point.log_likelihood > 100 * far.expected
 
 
 @pytest.mark.slow

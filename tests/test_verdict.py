@@ -27,7 +27,7 @@ def fitted(*names, evidence, passes=True, scores=(), told=0.0):
     hypothesis = Hypothesis(tuple(SHIPPED.get("effect", n) for n in names))
     return SimpleNamespace(
         hypothesis=hypothesis, name=hypothesis.name, evidence=evidence, passes=passes,
-        against=() if passes else ("a stretch of steps is off",), promised=scores, told=told, fit=None, shared=None,
+        against=() if passes else ("a stretch of steps is off",), singles=scores, told=told, fit=None, shared=None,
     )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
-"""Tables of numbers that follow a model's parameters: cubic splines with evenly spaced knots, as generated code calls them.
+"""Tables of coefficients that follow a model's parameters: cubic splines with evenly spaced knots, as generated code calls them.
 
-Behind the parameters in `p` stand, for each table, the place of its numbers in `p`, its first knot, the spacing and how many
-numbers it has, then the numbers. A table of n numbers covers n - 3 intervals; beyond them it is constant.
+Behind the parameters in `p` stand, for each table, the place of its coefficients in `p`, its first knot, the spacing and how many
+coefficients it has, then the coefficients. A table of n covers n - 3 intervals; beyond them it is constant.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Spline:
-    """A function of one unknown: `first` knot, `spacing`, and its numbers (n,), n - 3 of which are intervals."""
+    """A function of one unknown: `first` knot, `spacing`, and its coefficients (n,), n - 3 of which are intervals."""
 
     first: float
     spacing: float
-    numbers: Array
+    coefficients: Array
 
     @classmethod
     def over(cls, low: float, high: float, spacing: float) -> Spline:
@@ -33,48 +33,48 @@ class Spline:
 
     @classmethod
     def none(cls) -> Spline:
-        """Return a table without numbers, which is 0 everywhere."""
+        """Return a table without coefficients, which is 0 everywhere."""
         return cls(0.0, 1.0, np.zeros(0))
 
     @property
     def last(self) -> float:
         """Return where the last interval ends."""
-        return self.first + self.spacing * (self.numbers.size - 3)
+        return self.first + self.spacing * (self.coefficients.size - 3)
 
     @property
     def nodes(self) -> Array:
         """Return where each number's own bump is centred (n,)."""
-        return np.asarray(self.first + self.spacing * (np.arange(self.numbers.size) - 1.0))
+        return np.asarray(self.first + self.spacing * (np.arange(self.coefficients.size) - 1.0))
 
     def weights(self, x: Array) -> tuple[NDArray[np.int64], Array]:
-        """Return, for each x (m,), the first of the four numbers that count there, and their weights (m, 4)."""
-        cell, share = _cells(self.first, self.spacing, self.numbers.size, np.asarray(x, dtype=float))
+        """Return, for each x (m,), the first of the four coefficients that count there, and their weights (m, 4)."""
+        cell, share = _cells(self.first, self.spacing, self.coefficients.size, np.asarray(x, dtype=float))
         return cell, np.stack(_WEIGHTS[0](share), axis=-1)
 
     def design(self, x: Array) -> Array:
-        """Return the matrix (m, n) that turns the numbers into values at x (m,)."""
+        """Return the matrix (m, n) that turns the coefficients into values at x (m,)."""
         cell, weights = self.weights(x)
-        out = np.zeros((np.size(x), self.numbers.size))
+        out = np.zeros((np.size(x), self.coefficients.size))
         for k in range(4):
             out[np.arange(np.size(x)), cell + k] += weights[:, k]
         return out
 
     def __call__(self, x: Array) -> Array:
         """Return the values at x."""
-        return self.design(np.atleast_1d(x)) @ self.numbers
+        return self.design(np.atleast_1d(x)) @ self.coefficients
 
-    def with_numbers(self, numbers: Array) -> Spline:
-        """Return the same knots with other numbers."""
-        return Spline(self.first, self.spacing, np.asarray(numbers, dtype=float))
+    def with_coefficients(self, coefficients: Array) -> Spline:
+        """Return the same knots with other coefficients."""
+        return Spline(self.first, self.spacing, np.asarray(coefficients, dtype=float))
 
 
 def appended(p: Array, tables: Sequence[Spline]) -> Array:
     """Return p (n_parameters,) followed by the tables."""
     place, heads, numbers = p.size + 4 * len(tables), [], []
     for table in tables:
-        heads.append([place, table.first, table.spacing, table.numbers.size])
-        numbers.append(table.numbers)
-        place += table.numbers.size
+        heads.append([place, table.first, table.spacing, table.coefficients.size])
+        numbers.append(table.coefficients)
+        place += table.coefficients.size
     return np.concatenate([p, np.ravel(heads), *numbers]) if tables else p
 
 
@@ -84,7 +84,7 @@ def tables_after(n: int) -> tuple[Callable[..., Any], Callable[..., Any], Callab
 
 
 def _evaluated(n: int, order: int, p: Any, i: int, x: Any) -> Any:
-    """Return a derivative of table i at x, a number or an array, real or complex; 0 where no numbers follow the parameters."""
+    """Return a derivative of table i at x, a number or an array, real or complex; 0 without coefficients."""
     if len(p) <= n or p[n + 4 * i + 3] < 4:
         return 0.0 * x
     place, first, spacing, count = (float(np.real(value)) for value in p[n + 4 * i : n + 4 * i + 4])

@@ -1,10 +1,10 @@
 """The search for what a model lacks, over state-space fits: one queue, one score, one budget.
 
 A model is the baseline with a set of effects, or with another ageing law. Each model that was fitted says, at first order, what
-each effect could still explain; the model that promises most is fitted next. The score of a model is its log marginal likelihood
-by Laplace's method, with flat priors within the bounds of its parameters, Cauchy priors about the typical sizes of its effects,
-and a prior on their number. The search ends when the best model passes its tests and nothing that is left promises to come close,
-or when the budget is spent.
+each effect could still explain; the model with the largest expected evidence is fitted next. The score of a model is its log
+marginal likelihood by Laplace's method, with flat priors within the bounds of its parameters, Cauchy priors about the typical
+sizes of its effects, and a prior on their number. The search ends when the best model passes its tests and no other is expected
+to come close, or when the budget is spent.
 Best-first search: Pearl, Heuristics, 1984; Laplace's method: Kass and Raftery, JASA 90 (1995).
 """
 
@@ -56,7 +56,7 @@ from srfcli.laws.values import Effect
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, each at p = 1e-6
 CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
 MOST_EFFECTS = 2  # effects of a model
-MOST_FOLLOWED = 5  # promises of each model that are followed
+MOST_FOLLOWED = 5  # extensions of each model that are fitted
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 SEARCH_RTOL = 1e-3  # tolerance of the integration: 0.02 in log likelihood
 BUDGET = 300.0  # s of CPU, or more
@@ -71,7 +71,7 @@ FOLLOWED = 0.1  # least amplitude of the field from which an extended model is f
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model fitted: log evidence, what speaks against it (nothing where it passes), what it leaves, what effects promise.
+    """A model fitted: log evidence, what speaks against it (nothing where it passes), what it leaves, the scores of effects.
 
     `separate` is the log evidence where each run has a field of its own; of it `mass_at_bounds` comes from parameters at a bound.
     `shared` is what a field that all runs share gains beyond NEEDED at first order, None where an effect says what all runs share
@@ -118,7 +118,7 @@ class Fitted:
         return self.evidence - self.mass_at_bounds
 
     @property
-    def promised(self) -> Sequence[Score]:
+    def singles(self) -> Sequence[Score]:
         """Return the scores of the effects that it lacks, largest first."""
         return self.scores.singles if self.scores else ()
 
@@ -220,7 +220,7 @@ class ModelSearch:
             found = self._as_it_is(move, move.origin.smooth, move.origin.likelihood.processes)
         else:
             found = fitted(self._started(move) if move else None)
-            if move and options["processes"] is None:  # what promised it had neither field nor colour
+            if move and options["processes"] is None:  # its score was taken without field and colour
                 found = max(found, self._as_it_is(move, True, ()), key=lambda f: f.criterion)
         if move and "processes" not in self.options:
             found = with_less_colour(found, NEAR, self.progress)
@@ -233,7 +233,7 @@ class ModelSearch:
         """Return a fit that begins where a move says, under no wider field, without one if `smooth`, with colour as given."""
         likelihood, x = self._begun(move, smooth, processes)
         begun = maximise(likelihood, x, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
-        if not begun.promised > self.best().evidence - CLOSE_CALL:
+        if not begun.expected > self.best().evidence - CLOSE_CALL:
             return StateSpaceFit(likelihood, begun)
         return self._state_space(likelihood.problem, part=StateSpaceFit(likelihood, begun))
 
@@ -334,8 +334,8 @@ class ModelSearch:
     def run(self) -> Fitted:
         """Return the best model; `ranked` has all that were fitted.
 
-        First-order scores and fits from one start mislead. So each model that is the best when nothing is left that promises to
-        come close is asked in turn what may have misled, and the search goes on with what that brings.
+        First-order scores and fits from one start mislead. So where no other model is expected to come close, the further steps
+        are done for the best, one at a time, and the search goes on with what that brings.
         """
         self.progress("baseline")
         base = self._record(self.fit(None))
@@ -344,7 +344,7 @@ class ModelSearch:
             base = self._expand(self._with_own_noise(base))
             if taken_up(base.fit):  # field or noise make up for what is missing: without them it shows, or it is another law
                 self._take(self._expand_without_field, base)
-                if self._promising(base):  # what has been likelier, else what is expected to be
+                if self._within_reach(base):  # what has been likelier, else what is expected to be
                     move = max(self.queue, key=lambda m: (max(m.reached, base.evidence), -m.expected))
                     self._fit_next(self._taken_out(move))
                 self._between_runs()
@@ -358,7 +358,7 @@ class ModelSearch:
         if self.baseline.scores is None:  # from the best model's parameters it came to another maximum
             self._expand(self.baseline)
         best = self.best()
-        self.cut_short |= self.spent and (not best.passes or self._promising(best) or self._expandable(best))
+        self.cut_short |= self.spent and (not best.passes or self._within_reach(best) or self._expandable(best))
         if self.experiment.runs is not self.whole.runs:
             self._fit_all()
         return self.best()
@@ -374,7 +374,7 @@ class ModelSearch:
                 return
 
     def _go_on(self) -> bool:
-        """Where no model passes, expand the next best, or fit what promises less than the best; return whether there was any."""
+        """Where no model passes, expand the next best, or fit what is expected below the best; return whether there was any."""
         other = next(filter(self._expandable, self.ranked()), None)
         if self.best().passes or self.spent or (other is None and not self.queue):
             return False
@@ -440,12 +440,12 @@ class ModelSearch:
         """Return whether the budget is used up."""
         return time.process_time() - self.begun > self.budget
 
-    def _promising(self, best: Fitted) -> bool:
+    def _within_reach(self, best: Fitted) -> bool:
         """Return whether a model that waits is expected to come close to the best."""
         if not self.queue:
             return False
         if self.experiment.thresholds and not best.passes and self.queue[0].fresh:
-            return True  # far off the first order promises too little
+            return True  # far off the first order says too little
         return -self.queue[0].expected >= best.evidence - CLOSE
 
     def _expandable(self, node: Fitted) -> bool:
@@ -462,7 +462,7 @@ class ModelSearch:
             best = self.best()
             self.queue = [m for m in self.queue if self._outdo(m.gain, m.gains)]
             heapq.heapify(self.queue)
-            if self._promising(best):
+            if self._within_reach(best):
                 self._fit_next(heapq.heappop(self.queue))
             elif (self._with_more_colour, best.name) not in self._taken:
                 self._take(self._with_more_colour, best)
@@ -502,13 +502,13 @@ class ModelSearch:
         return move
 
     def _expand(self, node: Fitted) -> Fitted:
-        """Push what a fitted model promises: one more effect, two at once, something built in, another ageing law."""
+        """Push the extensions of a fitted model: one more effect, two at once, something built in, another ageing law."""
         self.progress(f"{node.name}: scores")
         scores = self._scores(node)
         self.excluded += scores.excluded
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
-        self._push(self._promised(node, node, self._gains(scores), WORTH if node.passes and not node.random else CLOSE))
+        self._push(self._extensions(node, node, self._gains(scores), WORTH if node.passes and not node.random else CLOSE))
         self._push([m for e in self._joining(node) if (e.settings or e.observed) and (m := self._built_in(node, e))])
         return node
 
@@ -527,15 +527,15 @@ class ModelSearch:
         """Return the effects' gains at first order, in all runs and in one alone."""
         return [(s.gain, s) for s in scores.every] + [(s.gain - self._rarer, s) for s in scores.alone]
 
-    def _promised(
-        self, node: Fitted, at: Fitted, promised: Sequence[tuple[float, Score]], least: float, *, noise: bool = True
+    def _extensions(
+        self, node: Fitted, at: Fitted, gains: Sequence[tuple[float, Score]], least: float, *, noise: bool = True
     ) -> list[_Move]:
-        """Return the effects that promise most beside those of `node`, by their gains (m,) at first order from the fit `at`.
+        """Return the extensions of `node` by the effects with the largest gains (m,) at first order from the fit `at`.
 
         Unless its field and gauge `noise` are kept, they are estimated anew.
         """
         moves = []
-        for gain, score in sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])[:MOST_FOLLOWED]:
+        for gain, score in sorted((p for p in gains if p[0] > least), key=lambda p: -p[0])[:MOST_FOLLOWED]:
             hypothesis = Hypothesis((*node.hypothesis.effects, score.effect), node.hypothesis.ageing)
             sizes = (*self._sizes(at), score.values)
             own = {n: score.shifts[n] for n in at.fit.likelihood.problem.names if score.shifts.get(n)}
@@ -556,28 +556,28 @@ class ModelSearch:
                 self._expected[name] = max(-move.expected, self._expected.get(name, -np.inf))
 
     def _expand_without_field(self, node: Fitted) -> None:
-        """Push what effects promise from a fit without field and colour, where these may have taken up what the model lacks.
+        """Push extensions by scores from a fit without field and colour, where these may have taken up what the model lacks.
 
         Under a field that no track has, the scores of what is missing are as low as those of what is not. Beside a best model
-        that passes, only what promises more than an effect of that.
+        that passes, only effects with a larger score than one of its own.
         """
         best = self.best()
         passed = best.passes and best.name != node.name and not best.hypothesis.effects
         rough = taken_up(node.fit) or field_share(node.fit) > WIDE_FIELD
         if len(node.hypothesis.effects) == MOST_EFFECTS or passed or not rough:
             return
-        bare = Likelihood(node.fit.likelihood.problem, smooth=True, rtol=SEARCH_RTOL)
-        found = maximise(bare, bare.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
+        smooth = Likelihood(node.fit.likelihood.problem, smooth=True, rtol=SEARCH_RTOL)
+        found = maximise(smooth, smooth.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
         if found.status is Status.INTEGRATION:  # without a field nothing follows the recordings
             return
-        plain = self._passed(node.hypothesis, StateSpaceFit(bare, found))
+        plain = self._passed(node.hypothesis, StateSpaceFit(smooth, found))
         self.progress(f"{node.name}: scores without field and colour")
         scores = self._scores(plain)
-        every = sorted(self._gains(scores), key=lambda p: p[0])  # of variants the one that promises most
+        every = sorted(self._gains(scores), key=lambda p: p[0])  # of variants the one with the largest score
         known = {(score.effect.reported, score.effect.run): gain for gain, score in every}
         for alone in (False, True):  # as many in one run alone as in all
-            promised = [(gain, score) for gain, score in every if bool(score.effect.run) is alone and self._outdo(gain, known)]
-            self._push([replace(m, gains=known) for m in self._promised(node, plain, promised, WORTH, noise=False)])
+            larger = [(gain, score) for gain, score in every if bool(score.effect.run) is alone and self._outdo(gain, known)]
+            self._push([replace(m, gains=known) for m in self._extensions(node, plain, larger, WORTH, noise=False)])
 
     def _outdo(self, gain: float, gains: Mapping[tuple[str, str], float]) -> bool:
         """Return whether a gain is larger than that of each effect of the best model, of the same scores, where that passes."""
@@ -617,7 +617,7 @@ class ModelSearch:
         if not np.isfinite(best):
             return None
         found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
-        gain = found.promised - node.fit.log_likelihood
+        gain = found.expected - node.fit.log_likelihood
         if not gain > (WORTH if node.passes else 0.0):
             return None
         self.count += 1
@@ -649,7 +649,7 @@ class ModelSearch:
     def _with_more_colour(self, best: Fitted) -> None:
         """Fit the best model with as much coloured noise as Schwarz's criterion wants, where nothing else speaks against it.
 
-        No effect promises to explain then why innovations are correlated.
+        No effect is expected to explain then why innovations are correlated.
         """
         if best.against == (CORRELATED,):
             found = self._state_space(best.fit.likelihood.problem, part=best.fit, cautious=False)
@@ -740,16 +740,16 @@ class ModelSearch:
             found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
             waiting.append((hypothesis, beside, own, found))
             if not taken_up(StateSpaceFit(own, found)):
-                highest = max(highest, self._lead_on(*waiting.pop(), highest))
+                highest = max(highest, self._carry_on(*waiting.pop(), highest))
                 if self.best().passes and self.best().hypothesis.reported:
                     return
         for trial in sorted(waiting, key=lambda w: -w[3].point.log_likelihood)[:FEWEST]:
-            highest = max(highest, self._lead_on(*trial, highest))
+            highest = max(highest, self._carry_on(*trial, highest))
             if self.best().passes and self.best().hypothesis.reported:
                 return
 
-    def _lead_on(self, hypothesis: Hypothesis, beside: Likelihood, own: Likelihood, found: Maximum, highest: float) -> float:
-        """Fit a model that was begun from the file's start values where that promises enough; return the likelihood it reached.
+    def _carry_on(self, hypothesis: Hypothesis, beside: Likelihood, own: Likelihood, found: Maximum, highest: float) -> float:
+        """Fit a model begun from the start values of the file where enough is expected of it; return the likelihood it reached.
 
         With coloured noise as that of the baseline, too. What is far behind the highest, without coloured noise, is left.
         """
@@ -762,7 +762,7 @@ class ModelSearch:
             noise = {n: v for n, v in self.baseline.fit.values.items() if n.startswith("gauge_")}
             x = beside.coordinates({**found.point.values, **noise})
             places.append((beside, maximise(beside, x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)))
-        if move := self._led_to(hypothesis, *max(places, key=lambda p: p[1].point.log_likelihood)):
+        if move := self._move_from(hypothesis, *max(places, key=lambda p: p[1].point.log_likelihood)):
             best = self.best()
             if -move.expected > best.evidence - (CLOSE if best.passes else HOPELESS):
                 self._fit_next(move)
@@ -780,15 +780,15 @@ class ModelSearch:
     def _try_ageing_laws(self, best: Fitted) -> None:
         """Push the other ageing laws, each after a few steps from where the baseline or the best model stands.
 
-        The law that promises most goes on from there: the right one lies further off than a step tells. Where the best model has
-        another law than the stated one, it is to be the likeliest of them, and each is scored to its maximum.
+        The law with the largest expected likelihood is scored further: the right one lies farther off than a step tells. If the
+        best model has another law than the stated one, it is to be the likeliest of them, and each is scored to its maximum.
         """
         whole = bool(best.hypothesis.ageing)
         reached = [(law[0], *near) for law in self._other_laws(best) if (near := self._near(*law, whole))]
-        for number, (hypothesis, likelihood, found) in enumerate(sorted(reached, key=lambda r: -r[2].promised)):
+        for number, (hypothesis, likelihood, found) in enumerate(sorted(reached, key=lambda r: -r[2].expected)):
             if number == 0 and found.away > 1.0:
                 found = maximise(likelihood, found.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
-            self._push([move] if (move := self._led_to(hypothesis, likelihood, found)) else [])
+            self._push([move] if (move := self._move_from(hypothesis, likelihood, found)) else [])
 
     def _other_laws(self, best: Fitted) -> list[tuple[Hypothesis, Likelihood]]:
         """Return the ageing laws that neither the baseline nor the best model has, each with its likelihood."""
@@ -798,7 +798,7 @@ class ModelSearch:
         return [(hypothesis, likelihood) for hypothesis, likelihood in own if likelihood is not None]
 
     def _near(self, hypothesis: Hypothesis, likelihood: Likelihood, whole: bool = False) -> tuple[Likelihood, Maximum] | None:
-        """Return where a law is led from where the baseline or the best stands, by a few steps or the whole way.
+        """Return where scoring takes a law from where the baseline or the best stands, by a few steps or the whole way.
 
         None if it was begun there already.
         """
@@ -812,15 +812,15 @@ class ModelSearch:
         how: dict[str, Any] = {} if whole else {"steps": NEAR_STEPS, "widths": ()}
         return likelihood, maximise(likelihood, x, close=1.0, progress=self.progress, **how)
 
-    def _led_to(self, hypothesis: Hypothesis, likelihood: Likelihood, found: Maximum) -> _Move | None:
-        """Return a model of one part more, or another law, that goes on from there; None where it promises too little."""
+    def _move_from(self, hypothesis: Hypothesis, likelihood: Likelihood, found: Maximum) -> _Move | None:
+        """Return a model of one part more, or another law, that goes on from there; None where too little is expected of it."""
         node = self.baseline
-        if not found.promised > node.fit.log_likelihood + (WORTH if node.passes else -HOPELESS):
+        if not found.expected > node.fit.log_likelihood + (WORTH if node.passes else -HOPELESS):
             return None
         self.count += 1
-        expected = found.promised - node.fit.log_likelihood + node.attainable + len(hypothesis.effects) * self._one_more
-        bare = node.fit.likelihood.processes and not likelihood.processes  # its noise is to be estimated anew
-        values = {n: v for n, v in found.point.values.items() if not (bare and n.startswith("gauge_"))}
+        expected = found.expected - node.fit.log_likelihood + node.attainable + len(hypothesis.effects) * self._one_more
+        plain_noise = node.fit.likelihood.processes and not likelihood.processes  # its noise is to be estimated anew
+        values = {n: v for n, v in found.point.values.items() if not (plain_noise and n.startswith("gauge_"))}
         return _Move(-expected, self.count, hypothesis, values, _sizes_of(hypothesis, likelihood.problem.model, values))
 
     def _in_all_runs(self, best: Fitted) -> None:

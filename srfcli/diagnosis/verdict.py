@@ -151,7 +151,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     best = close[0] if close else best
     shown = on_the_track_of(best, baseline) if best.passes else baseline
     held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
-    scores = tuple(baseline.promised)
+    scores = tuple(baseline.singles)
     ungated, reasons = _said(best, close, scores, search.cut_short)
     refused = refusal(best, baseline, held, held_loads) if ungated != "unknown" else ""
     verdict = "unknown" if refused else ungated
@@ -212,7 +212,7 @@ def unsteady_start(search: ModelSearch, best: Fitted) -> list[str]:
 def not_the_same(baseline: Fitted, best: Fitted) -> list[str]:
     """Return which parameter of the baseline differs in one run, where that gains more at first order than what was found."""
     own = next(iter(own_values(baseline.remainder)), None)
-    gains = [s.gain for s in baseline.promised] + [s.gain for s in (baseline.scores.alone if baseline.scores else ())]
+    gains = [s.gain for s in baseline.singles] + [s.gain for s in (baseline.scores.alone if baseline.scores else ())]
     least = max(gains, default=0.0) if best is not baseline else WORTH
     if own is None or own.gain < max(least, WORTH):
         return []

@@ -54,7 +54,7 @@ def _end(found: StateSpaceFit, name: str, side: float, refits: Refits) -> float 
 
 
 def not_quadratic(found: StateSpaceFit) -> list[str]:
-    """Return the parameters at whose ends of 1.96 standard errors the likelihood is not what the covariance promises.
+    """Return the parameters at whose ends of 1.96 standard errors the likelihood is not what the covariance says.
 
     The others follow by the covariance and are not refitted: a ridge that bends is found, too.
     """

@@ -287,7 +287,7 @@ def predict(
     moving = [k for k in own if not by[k].endswith(".trend")]
     names = [by[k] for k in moving]
     places = [model.index(n) if n in model.names else -1 for n in names]
-    numbers = [int(p[len(model.names) + 4 * i]) + j for i in by_tables for j in range(tables[i].numbers.size)]
+    numbers = [int(p[len(model.names) + 4 * i]) + j for i in by_tables for j in range(tables[i].coefficients.size)]
     share = np.array([stiffness_share(experiment, run) if n == "K" else 1.0 for n in names] + [1.0] * len(numbers))
     x0, S0 = start_state(model, run, p, values, names, numbers)
     size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])

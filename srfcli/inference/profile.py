@@ -44,7 +44,7 @@ class Refits:
 
 
 def quadratic(deviances: Sequence[float]) -> bool:
-    """Return whether deviances at 1.96 standard errors either side are what these promise, within FARTHER squared."""
+    """Return whether deviances at 1.96 standard errors either side are what these say, within FARTHER squared."""
     return CHI2_95 / FARTHER**2 < min(deviances) <= max(deviances) < CHI2_95 * FARTHER**2
 
 

@@ -1,8 +1,9 @@
-"""The fit in which all runs slid on one and the same rough track: mu0 wanders along slip by a random function.
+"""The fit with one random friction field for all runs: mu0 varies with the place on the track by the same random function.
 
-The function is a cubic spline whose numbers have a Gaussian prior with a Matern covariance (smoothness 3/2) of unknown amplitude
-and length. Parameters and numbers are estimated together by Gauss-Newton steps on the motion itself, so that a stick-slip cycle
-that comes too early finds its cause in the track; amplitude and length by the marginal likelihood of the linearised problem.
+The function is a cubic spline whose coefficients have a Gaussian prior with a Matern covariance (smoothness 3/2) of unknown
+amplitude and length. Parameters and coefficients are estimated together by Gauss-Newton steps on the motion itself, so that a
+stick-slip cycle that comes too early finds its cause in the field; amplitude and length by the marginal likelihood of the
+linearised problem.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from srfcli.inference.noise import Noise, difference_level, estimate_noise, log_
 from srfcli.inference.prediction import Prediction, predict
 
 KNOT_SPACING = 0.8  # um between knots: contacts are renewed over half of it, and a finer track fits no better
-MOST_KNOTS = 300  # numbers of a track: a longer one has wider knots
+MOST_KNOTS = 300  # coefficients of a track: a longer one has wider knots
 AMPLITUDES = np.array([0.0, *np.geomspace(2e-5, 3e-3, 12)])
 LENGTHS = np.geomspace(1.0, 30.0, 6)
 GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the roughness that are tried
@@ -44,7 +45,7 @@ class FieldPrior:
     length: float = 5.0
 
     def root(self, nodes: Array) -> Array:
-        """Return L with L L' the covariance of a track's numbers."""
+        """Return L with L L' the covariance of a track's coefficients."""
         d = np.abs(nodes[:, None] - nodes[None, :]) * np.sqrt(3) / self.length
         K = (1 + d) * np.exp(-d) + 1e-8 * np.eye(nodes.size)
         return self.amplitude * np.linalg.cholesky(K)
@@ -74,7 +75,7 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
     for number in range(FIELD_ROUNDS):
         point = replace(point, prior=likelihood.prior(point))
         if not point.prior.amplitude:
-            point = replace(point, track=point.track.with_numbers(np.zeros(point.track.numbers.size)))
+            point = replace(point, track=point.track.with_coefficients(np.zeros(point.track.coefficients.size)))
         point = likelihood.minimise(point, noise, settled=EARLY_GAIN if number + 1 < FIELD_ROUNDS else LEAST_GAIN)
         noise = likelihood.noise(point)
         point = likelihood.at(point.theta, point.track, noise, point.prior)
@@ -129,7 +130,7 @@ class Point:
         """Return minus twice the log posterior, but for what does not change with parameters and track."""
         if not self.prior.amplitude:
             return self.chi2
-        return self.chi2 + float(np.sum(np.linalg.solve(self.prior.root(self.track.nodes), self.track.numbers) ** 2))
+        return self.chi2 + float(np.sum(np.linalg.solve(self.prior.root(self.track.nodes), self.track.coefficients) ** 2))
 
 
 class SharedLikelihood:
@@ -151,7 +152,7 @@ class SharedLikelihood:
 
     def at(self, theta: Array, track: Spline, noise: Mapping[str, Noise], prior: FieldPrior) -> Point:
         """Return everything at these parameters and this track."""
-        n, k = theta.size, theta.size + track.numbers.size
+        n, k = theta.size, theta.size + track.coefficients.size
         N, g, chi2, total, found = np.zeros((k, k)), np.zeros(k), 0.0, 0.0, {}
         self.evaluations += 1
         for run in self.problem.runs:
@@ -187,7 +188,7 @@ class SharedLikelihood:
                     break
                 free &= ~out
             theta = np.clip(theta, low, high)
-            track = point.track.with_numbers(point.track.numbers + move[n:]) if rough else point.track
+            track = point.track.with_coefficients(point.track.coefficients + move[n:]) if rough else point.track
             trial = self.at(theta, track, noise, point.prior)
             gained = point.penalised - trial.penalised
             if gained > 0:
@@ -221,7 +222,7 @@ class SharedLikelihood:
         A, b = T.T @ point.N @ T, T.T @ point.g
         if L.size:
             A[free.sum() :, free.sum() :] += np.eye(L.shape[1])
-            b[free.sum() :] -= np.linalg.solve(L, point.track.numbers)
+            b[free.sum() :] -= np.linalg.solve(L, point.track.coefficients)
         if not A.size:  # every parameter stands at a bound, and there is no track
             return np.zeros(point.g.size), 0.0
         A[np.diag_indices_from(A)] *= 1 + damping
@@ -261,7 +262,7 @@ def marginal(
         solved = solve_scaled(N[:n, :n], np.column_stack([g[:n], N[:n, n:]]))
         base += 0.5 * float(g[:n] @ solved[:, 0])
         G, h = G - N[n:, :n] @ solved[:, 1:], h - N[n:, :n] @ solved[:, 0]
-    now = track.numbers
+    now = track.coefficients
     b = h + G @ now
     smooth = base - float(h @ now) - 0.5 * float(now @ G @ now)
     lengths, amplitudes = grid

@@ -89,7 +89,7 @@ UNFELT = 1e-6  # twice the log likelihood that a parameter changes between its b
 FARTHEST_UPDATE = 3.0  # by a reading of ln v and ln PHI, a factor of 20 in v and PHI; standard deviations of the field
 FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
 BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
-CREEP = 0.1  # share of what the score promises that a step must gain where readings are weighted, or they are weighted otherwise
+CREEP = 0.1  # share of the gain expected by the score below which readings are weighted otherwise
 CONVERGED = 0.1  # standard errors: how far the maximum may still be, by the gradient
 TOLD = 2.0  # standard errors from the maximum to which a fit is moved for a run that it did not know: 2 in log likelihood
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
@@ -744,7 +744,7 @@ class Maximum:
     spread: Array | float = field(default=0.0, repr=False)
 
     @property
-    def promised(self) -> float:
+    def expected(self) -> float:
         """Return the log likelihood expected at the maximum; that of the point where scoring had yet to weigh all alike.
 
         Of recordings it is expected HOPELESS above the point at most: from farther off the score tells nothing of the maximum.
@@ -822,7 +822,7 @@ def maximise(
                 trial = likelihood.at(trial.x)
                 gain = _gain(trial, point, weights)
             if gain > 0:
-                share = gain / max(float(g @ move - 0.5 * move @ I @ move), 1e-300)  # of what the model of it promised
+                share = gain / max(float(g @ move - 0.5 * move @ I @ move), 1e-300)  # of what its quadratic model expects
                 damping = max(damping * (0.1 if share > 0.5 else 1.0 if share > 0.25 else 2.0), 1e-9)
                 last, point, sure = point, trial, share > 0.25
                 more = more if width else _curvature_beyond(last, point)
@@ -1267,7 +1267,7 @@ def _fitted(
     steps = SCORING_STEPS // 2 if fresh else 12
     found = from_any(wide, wide_starts(wide, start, progress), steps, progress)
     if found is None or (fresh and found.status is Status.INTEGRATION):
-        found = from_any(wide, starts_elsewhere(wide, wide.coordinates(start), progress)[: len(WIDE)], steps, progress)
+        found = from_any(wide, multi_start(wide, wide.coordinates(start), progress)[: len(WIDE)], steps, progress)
     assert found is not None
     if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
         found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
@@ -1276,14 +1276,14 @@ def _fitted(
     best = StateSpaceFit(wide, found)
     if found.status is Status.INTEGRATION:
         return best
-    if found.promised < least:
+    if found.expected < least:
         found = maximise(wide, found.point.x, close=close, progress=progress) if np.isinf(found.away) else found
         best = StateSpaceFit(wide, found)
-        if found.promised < least and processes is not None:
+        if found.expected < least and processes is not None:
             return best
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
     best = first = _with_colour(best, likelihood, progress, cautious, least) if processes is None else best
-    if best.maximum.promised < least:
+    if best.maximum.expected < least:
         return best
     best = _with_or_without(best, smooth, likelihood, close, progress)
     if thorough and processes is None:
@@ -1311,7 +1311,7 @@ def _fitted(
     if fresh and processes is None and best.maximum.point.surprising and best.values["field_amplitude"] > widest:
         coloured = likelihood(False, best.likelihood.processes or ("relaxation",))
         another = from_any(coloured, wide_starts(coloured, start, progress), steps, progress)
-        if another and another.promised > best.log_likelihood:
+        if another and another.expected > best.log_likelihood:
             other = StateSpaceFit(coloured, maximise(coloured, another.point.x, close=close, progress=progress))
             best = max(best, _with_or_without(other, smooth, likelihood, close, progress), key=lambda f: f.criterion)
     if fresh:
@@ -1352,12 +1352,12 @@ def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFi
     plain, maximum = fitted.likelihood, fitted.maximum
     inner = np.nonzero(np.diag(maximum.covariance) > 0)[0]
     at = [rough.names.index(plain.names[i]) for i in inner]
-    bare, logs = rough.coordinates(fitted.values), np.log(np.array(FAINT_FIELDS) * FAINT_FIELD / LEAST_FIELD)
+    start, logs = rough.coordinates(fitted.values), np.log(np.array(FAINT_FIELDS) * FAINT_FIELD / LEAST_FIELD)
     prior = np.array([logs[0], *np.repeat(np.gradient(logs), len(SHORT)) / len(SHORT)])  # below the first it is as none
     evidence, moves, covariances = [_laplace(maximum.point, inner)[0]], [np.zeros(inner.size)], []
     covariances.append(maximum.covariance[np.ix_(inner, inner)])
     for share, short in product(FAINT_FIELDS, SHORT):
-        x = _under_field(rough, bare, share * FAINT_FIELD, short)
+        x = _under_field(rough, start, share * FAINT_FIELD, short)
         likely = rough.at(x, slopes=False).log_likelihood > fitted.log_likelihood - DOWN
         point = rough.at(x, slopes=likely)
         if not likely:
@@ -1550,8 +1550,8 @@ def _with_colour(
                 break
         if found is best:
             break
-        last, best = found.maximum.promised - best.maximum.promised, found
-        if found.maximum.promised + max(last, 0.0) * (GAUGE_PROCESSES - len(found.likelihood.processes)) < least:
+        last, best = found.maximum.expected - best.maximum.expected, found
+        if found.maximum.expected + max(last, 0.0) * (GAUGE_PROCESSES - len(found.likelihood.processes)) < least:
             break
     return best
 
@@ -1576,10 +1576,10 @@ def with_less_colour(found: StateSpaceFit, close: float, progress: Callable[[str
         if fewer.at(x, slopes=False).log_likelihood < found.log_likelihood - CLOSE_CALL:
             break
         progress(f"coloured gauge noise: {', '.join(fewer.processes) or 'none'}")
-        bare = StateSpaceFit(fewer, maximise(fewer, x, close=close, widths=(), progress=progress))
-        if found.criterion > bare.criterion:
+        fewer_found = StateSpaceFit(fewer, maximise(fewer, x, close=close, widths=(), progress=progress))
+        if found.criterion > fewer_found.criterion:
             break
-        found = bare
+        found = fewer_found
     return found
 
 
@@ -1687,7 +1687,7 @@ def _with_or_without(
     at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
     faint = rough.lower[at] + np.log(FAINT_FIELD / LEAST_FIELD)
 
-    def bare(steps: int) -> StateSpaceFit:
+    def without_field(steps: int) -> StateSpaceFit:
         progress("without a field")
         values = plain.coordinates(found.point.values)
         own = maximise(plain, values, steps=steps, close=close, progress=progress)
@@ -1709,7 +1709,7 @@ def _with_or_without(
         if found.point.x[at] < last[at] - FIELD_SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
             found = replace(found, point=_shrunk(rough, found.point, at))
         if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
-            tried = bare(TRIAL_STEPS)
+            tried = without_field(TRIAL_STEPS)
             if tried.log_likelihood > found.point.log_likelihood and tried.maximum.away < close:
                 small = _small_field(rough, tried.maximum.point)
                 if small is None:
@@ -1723,9 +1723,9 @@ def _with_or_without(
     if tried is None:
         there = plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood
         if smooth or there > found.point.log_likelihood - HOPELESS:
-            tried = bare(SCORING_STEPS)
+            tried = without_field(SCORING_STEPS)
         elif found.point.x[at] < faint:  # an oscillation is integrated more closely, so that its narrow maximum is next to this
-            tried = bare(TRIAL_STEPS)
+            tried = without_field(TRIAL_STEPS)
     if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
         return best
     if tried.maximum.away < close:
@@ -1741,12 +1741,12 @@ def _beside_small_field(fitted: StateSpaceFit, likelihood: Callable[[bool, Seque
     return fitted if small is None else StateSpaceFit(rough, replace(fitted.maximum, point=small))
 
 
-def _small_field(rough: Likelihood, bare: Point) -> Point | None:
+def _small_field(rough: Likelihood, plain: Point) -> Point | None:
     """Return where a few steps lead from the likeliest of a few small fields beside a fit, None where that gains too little.
 
     The likeliest amplitude is taken at the middle length, and then the likeliest length.
     """
-    x, middle = rough.coordinates(bare.values), len(SHORT) // 2
+    x, middle = rough.coordinates(plain.values), len(SHORT) // 2
 
     def tried(share: float, short: float) -> tuple[float, float, float]:
         return rough.at(_under_field(rough, x, share * FAINT_FIELD, short), slopes=False).log_likelihood, share, short
@@ -1755,10 +1755,10 @@ def _small_field(rough: Likelihood, bare: Point) -> Point | None:
     height, share, short = max(likeliest, *(tried(likeliest[1], s) for s in (*SHORT[:middle], *SHORT[middle + 1 :])))
     if not np.isfinite(height):
         return None
-    x, least = _under_field(rough, x, share * FAINT_FIELD, short), bare.log_likelihood + NEEDED
+    x, least = _under_field(rough, x, share * FAINT_FIELD, short), plain.log_likelihood + NEEDED
     for _ in range(FIELD_STEPS // 2):
         found = maximise(rough, x, steps=2, widths=())
-        if found.promised < least or found.away < CONVERGED or np.array_equal(found.point.x, x):
+        if found.expected < least or found.away < CONVERGED or np.array_equal(found.point.x, x):
             break
         x = found.point.x
     return found.point if found.point.log_likelihood > least else None
@@ -1849,7 +1849,7 @@ def wide_starts(rough: Likelihood, start: Mapping[str, float], progress: Callabl
             yield trial.x
 
 
-def starts_elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
+def multi_start(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
     """Return SOBOL_STARTS starts over the bounds, mu0 that of the recordings, under wide fields in turn, the likeliest first.
 
     A model that slips without end at the file's start values, as one without inertia may, is followed from others.
@@ -1867,7 +1867,7 @@ def starts_elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None
         trial = np.clip(trial, rough.lower, rough.upper)
         trial = _under_field(rough, trial, *WIDE[number % len(WIDE)])
         found = rough.at(trial, slopes=False).log_likelihood
-        progress(f"from elsewhere: log likelihood {found:.1f}")
+        progress(f"from another start: log likelihood {found:.1f}")
         if np.isfinite(found):
             trials.append((found, trial))
     return [trial for _, trial in sorted(trials, key=lambda t: -t[0])] or [x]

@@ -62,7 +62,7 @@ class Crossing:
     rates: Array | None = None
 
     def expected(self, y: Array) -> float:
-        """Return the load that the derivatives promise at coordinates `y`, moved by no more than a factor e^0.2."""
+        """Return the load by the derivatives at coordinates `y`, moved by no more than a factor e^0.2."""
         if self.rates is None:
             return self.load
         return float(self.load * np.exp(np.clip(self.rates @ (y - self.y), -SURVEY_REACH, SURVEY_REACH)))
@@ -381,7 +381,7 @@ class ThresholdFit:
     """A table fitted by one or both methods; `status` is the worst of theirs.
 
     `intervals` are by the profile likelihood from the lowest chi2, where they were asked for; without them `not_quadratic`
-    are the parameters whose standard errors promise another chi2 than there is at their ends.
+    are the parameters at whose ends chi2 is not what their standard errors say.
     """
 
     table: Thresholds
@@ -507,7 +507,7 @@ def _ridge(scale: Scale, best: MethodFit, k: int) -> tuple[float, Array]:
 
 
 def _not_quadratic(work: _Work, best: MethodFit) -> tuple[str, ...]:
-    """Return the parameters at whose ends of 1.96 standard errors, the others by correlation, chi2 is not that promised."""
+    """Return the parameters at whose ends of 1.96 standard errors, the others by correlation, chi2 is not what these say."""
     scale, found = work.matcher.scale, []
     for k, name in enumerate(scale.names):
         error, along = _ridge(scale, best, k)

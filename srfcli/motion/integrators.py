@@ -81,7 +81,7 @@ def integrate(
     `Stopped`, where the integration is compiled.
     """
     library = compiled(model)
-    count = len(by) + sum(tables[i].numbers.size for i in by_tables)
+    count = len(by) + sum(tables[i].coefficients.size for i in by_tables)
     S0 = np.zeros((start.size, count)) if S0 is None else np.ascontiguousarray(S0, dtype=float)
     missing = len(model.namespace.get("TABLES", ())) - len(tables)
     p = appended(np.asarray(p, dtype=float), [*tables, *[Spline.none()] * missing]) if tables or missing else p
@@ -91,7 +91,7 @@ def integrate(
         return integrate_lsoda(model, p, drive, load, t, start, by, S0, rtol, atol)
     own, columns = len(by), np.full(max(len(tables), 1), -1, dtype=np.intc)
     for i in by_tables:
-        columns[i], own = own, own + tables[i].numbers.size
+        columns[i], own = own, own + tables[i].coefficients.size
     x, S = np.full((t.size, start.size), np.nan), np.full((t.size, *S0.shape), np.nan)
     stats, stop = np.zeros(4), ctypes.c_int(0)
     arguments = (

@@ -314,7 +314,7 @@ def scores(matter: Matter) -> Markup:
         size, least = with_error(s.get("size"), s.get("stderr")), number(s.get("detectable"), 2)
         rows.append([s["effect"], number(s.get("gain")), size, percent(s.get("tolerance")), least])
     caption = (
-        "At first order: the gain in log likelihood that each effect promises, the size it would have from its neutral value, "
+        "At first order: the gain in log likelihood expected of each effect, the size it would have from its neutral value, "
         "the share of its signal that the baseline's own parameters cannot absorb, and the smallest size that this experiment "
         "could have seen (in um, s and N, or MPa)."
     )
