@@ -442,7 +442,7 @@ def test_a_case_costs_no_more_than_itself(new_trial, tmp_path):
     assert [found[f"case-00{k}"].verdict for k in range(4)] == ["failed", "failed", "failed", "none"]
     assert found["case-000"].failure.startswith("ValueError: a matrix is singular; in_workers.py, line ")
     assert "killed" in found["case-001"].failure
-    assert found["case-002"].failure == "more than 1 s of CPU" and 0.8 < found["case-002"].cpu < 5
+    assert found["case-002"].failure == "more than 1 s of CPU" and found["case-002"].cpu > 0.8
     assert read_answers(trial.answers) == found
     assert {len(a.code) for k, a in found.items() if k != "case-001"} == {12}
 

@@ -18,11 +18,11 @@ from srfcli.results.tables import Column, Table
 # `srf config`: which values a command would use, and who set them.
 
 COLUMNS = (
-    Column("name", about="choice or parameter"),
-    Column("value", about="in its declared unit", format=".12g"),
-    Column("unit", about="declared unit"),
-    Column("origin", about="flag, environment variable, srf.toml or default"),
-    Column("about", about="meaning"),
+    Column("name", "", "choice or parameter"),
+    Column("value", "", "in its declared unit", format=".12g"),
+    Column("unit", "", "declared unit"),
+    Column("origin", "", "flag, environment variable, srf.toml or default"),
+    Column("about", "", "meaning"),
 )
 
 

@@ -42,10 +42,10 @@ SCHEMA = "srf.diagnose/"
 
 HYPOTHESES = (
     Column("hypothesis", "", "effects added to the baseline"),
-    Column("evidence", "", "log marginal likelihood over that of the baseline", ".1f"),
-    Column("rms_over_noise", "", "of the innovations: 1 where all but noise is explained", ".4f"),
-    Column("field", "", "amplitude of the random friction that it needs", ".2g"),
-    Column("confidence", "", "stated", ".3f"),
+    Column("evidence", "1", "log marginal likelihood over that of the baseline", ".1f"),
+    Column("rms_over_noise", "1", "of the innovations: 1 where all but noise is explained", ".4f"),
+    Column("field", "1", "amplitude of the random friction that it needs", ".2g"),
+    Column("confidence", "1", "stated", ".3f"),
     Column("against", "", "what speaks against it"),
 )
 PARAMETERS = (
@@ -55,15 +55,15 @@ PARAMETERS = (
     Column("augmented", "", "estimate in the final model"),
     Column("augmented_stderr", "", "its standard error", ".2g"),
     Column("unit", "", "of the four before"),
-    Column("shift_sigma", "", "shift of the baseline's estimate, in the final model's standard errors", ".1f"),
+    Column("shift_sigma", "1", "shift of the baseline's estimate, in the final model's standard errors", ".1f"),
 )
 RUNS = (
     Column("run", "", "name"),
     Column("role", "", "fit, or held out"),
     Column("baseline", "", "innovations over noise, rms", ".4f"),
     Column("augmented", "", "innovations over noise, rms", ".4f"),
-    Column("share", "", "of the baseline's excess misfit", ".2f"),
-    Column("p_value", "", "adjusted for all that was looked at", ".1g"),
+    Column("share", "1", "of the baseline's excess misfit", ".2f"),
+    Column("p_value", "1", "adjusted for all that was looked at", ".1g"),
     Column("where", "", "times (s) that hold most of it"),
 )
 LOADS = (

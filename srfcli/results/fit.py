@@ -54,9 +54,9 @@ RUNS = (
     Column("rms", "", "of the residual, in the unit beside it"),
     Column("white_noise", "", "standard deviation of the gauge's white noise"),
     Column("unit", "", "of the two columns before"),
-    Column("rms_over_noise", "", "1 where the model explains all but the noise", ".4g"),
-    Column("lag1", "", "correlation of neighbouring residuals", ".3g"),
-    Column("order", "", "how many times of correlation the gauge's noise has"),
+    Column("rms_over_noise", "1", "1 where the model explains all but the noise", ".4g"),
+    Column("lag1", "1", "correlation of neighbouring residuals", ".3g"),
+    Column("order", "1", "how many times of correlation the gauge's noise has"),
 )
 TABLES = (
     Column("table", "", "name"),
@@ -85,8 +85,8 @@ POSTERIOR = (
     Column("median", "", "of the draws"),
     Column("high", "", "97.5 % of the draws are below"),
     Column("unit", "", "of all the columns before"),
-    Column("effective", "", "independent draws that these are worth", ".0f"),
-    Column("r_hat", "", "spread over all chains to that within them; 1 where they agree", ".4f"),
+    Column("effective", "1", "independent draws that these are worth", ".0f"),
+    Column("r_hat", "1", "spread over all chains to that within them; 1 where they agree", ".4f"),
 )
 VARIED = (
     Column("parameter", "", "name"),
@@ -688,16 +688,16 @@ LEADING = (
     Column("experiment", "", "folder or file"),
     Column("status", "", "of the fit; failed where there is none"),
     Column("law", "", "friction and ageing law"),
-    Column("runs", "", "that were fitted"),
-    Column("samples", "", "compared in them"),
+    Column("runs", "1", "that were fitted"),
+    Column("samples", "1", "compared in them"),
     Column("V_min", "um/s", "lowest velocity of the drive"),
     Column("V_max", "um/s", "highest velocity of the drive"),
     Column("load", "", "mean of the fitted runs, in the unit beside it"),
     Column("load_unit", "", "N or MPa"),
-    Column("segments", "", "of constant velocity, one slip length D0 or longer"),
-    Column("steady", "", "of them, those that end in steady sliding"),
+    Column("segments", "1", "of constant velocity, one slip length D0 or longer"),
+    Column("steady", "1", "of them, those that end in steady sliding"),
     Column("final_slope", "1/mm", "largest change of friction with slip at the end of a segment, over its error 3 or more"),
-    Column("rms_over_noise", "", "1 where the model explains all but the noise"),
+    Column("rms_over_noise", "1", "1 where the model explains all but the noise"),
 )
 DERIVED = (
     Column("A_minus_B", "1", "A - B: above 0, friction rises with velocity"),

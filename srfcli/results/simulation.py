@@ -191,7 +191,7 @@ class SimulationResult(Result):
         unit = units.pop() if len(units) == 1 else "um, N or 1"
         beside = [column for column in OTHERS if any(column.name in job.beside for job in jobs)]
         columns = (
-            *([Column("run", "1", "name of the run")] if named else []),
+            *([Column("run", "", "name of the run")] if named else []),
             Column("t", "s", "time"),
             Column("V", "um/s", "driving velocity"),
             Column("W", "N", "imposed normal load"),

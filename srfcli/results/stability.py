@@ -152,7 +152,7 @@ class ResponseResult(Result):
         for name, (unit, about, _) in QUANTITIES.items():
             columns.append(Column(f"{name}_gain", unit, f"amplitude {about} for eps = 1, to first order"))
             columns.append(Column(f"{name}_phase", "rad", "ahead of the load"))
-        columns += [Column("type", "", "stable or unstable: steady sliding"), Column("status")]
+        columns += [Column("type", "", "stable or unstable: steady sliding"), Column("status", "", STATUS)]
         notes = ["to first order in eps: amplitudes are eps times the gains"]
         if self.name == "f":
             for name, values in parts.items():

@@ -389,7 +389,7 @@ TRACKS = ((False, False, "smooth"), (True, False, "rough track"), (True, True, "
 
 def confusion(marks: Sequence[Mark]) -> Table:
     """Return true kinds against verdicts; `right` counts the effects too, where they are named."""
-    columns = (Column("concealed"), Column("cases"), *map(Column, VERDICTS), Column("right"), Column("class_right"))
+    columns = (Column("concealed", ""), Column("cases"), *map(Column, VERDICTS), Column("right"), Column("class_right"))
     rows = []
     for kind, (rough, own, told) in product(WIDE_KINDS, TRACKS):
         chosen = [m for m in marks if m.kind == kind and m.rough == rough and m.own_track == own]
@@ -431,7 +431,7 @@ def rates(marks: Sequence[Mark]) -> Table:
     add("unknown recognised, where visible", [m for m in outside if m.visible], lambda m: m.answer.verdict == "unknown")
     add("something concealed is invisible", some, lambda m: not m.visible)
     add("failed", marks, lambda m: m.answer.verdict == "failed")
-    columns = (Column("measure"), *COUNTED, Column("aim", about="what it should reach"))
+    columns = (Column("measure", ""), *COUNTED, Column("aim", "", "what it should reach"))
     note = (f"invisible: fewer than {INVISIBLE:g} standard errors of its size, had one known its form; none, inconclusive and "
             "ambiguous are right there")  # fmt: skip
     return Table("srf.prove.rates/1", columns, rows, "Rates", (note,))
@@ -440,7 +440,7 @@ def rates(marks: Sequence[Mark]) -> Table:
 def by_effect(marks: Sequence[Mark]) -> Table:
     """Return, for each effect of the library, how often it was found alone, and named where it was one of two."""
     columns = (
-        Column("effect"), *COUNTED, Column("class_right"), Column("invisible"), Column("in_pairs"),
+        Column("effect", ""), *COUNTED, Column("class_right"), Column("invisible"), Column("in_pairs"),
         Column("named_in_pairs", about="among the names of the verdict"),
     )  # fmt: skip
     names = sorted({n for m in marks if m.kind in ("single", "pair") for n in m.hidden})
@@ -457,7 +457,7 @@ def by_effect(marks: Sequence[Mark]) -> Table:
 
 def by_outside(marks: Sequence[Mark]) -> Table:
     """Return, for each effect outside the library, how often it was called unknown, and what it was called else."""
-    columns = (Column("outside"), *COUNTED, Column("invisible"), Column("called", about="verdicts other than unknown"))
+    columns = (Column("outside", ""), *COUNTED, Column("invisible"), Column("called", "", "verdicts other than unknown"))
     rows = []
     for name in sorted({n for m in marks if m.kind == "outside" for n in m.hidden}):
         chosen = [m for m in marks if name in m.hidden]
@@ -470,7 +470,7 @@ def by_outside(marks: Sequence[Mark]) -> Table:
 def by_setting(marks: Sequence[Mark]) -> Table:
     """Return how often the answer was right by each circumstance in which something, or nothing, was concealed."""
     columns = (
-        Column("circumstance"), Column("value"), *COUNTED, Column("false_alarms", about="where nothing is concealed"),
+        Column("circumstance", ""), Column("value", ""), *COUNTED, Column("false_alarms", about="where nothing is concealed"),
         Column("nothing", about="cases that conceal nothing"), Column("named_wrongly", about="cases named wrongly"),
     )  # fmt: skip
     rows = []
@@ -487,7 +487,7 @@ def by_setting(marks: Sequence[Mark]) -> Table:
 def by_strength(marks: Sequence[Mark]) -> Table:
     """Return the power: how often something is seen, and named rightly, against how far one effect stands out."""
     columns = (
-        Column("measure"), Column("from", format=".3g"), Column("to", format=".3g"), Column("cases"),
+        Column("measure", ""), Column("from", format=".3g"), Column("to", format=".3g"), Column("cases"),
         Column("seen", about="the verdict says that something is missing"), Column("named", about="identified, and rightly"),
         *SHARE_COLUMNS,
     )  # fmt: skip
@@ -539,7 +539,7 @@ GROUPS: tuple[tuple[str, Callable[[Mark], bool]], ...] = (
 def held(marks: Sequence[Mark]) -> Table:
     """Return the held-out error over that of the model that knows the truth."""
     columns = (
-        Column("answers"), Column("cases"), Column("median", format=".3f"), Column("q90", format=".3f"),
+        Column("answers", ""), Column("cases"), Column("median", format=".3f"), Column("q90", format=".3f"),
         Column("within", about=f"at most {WITHIN}", format=".3f"), Column("baseline_median", format=".3f"),
     )  # fmt: skip
     rows = []
@@ -557,7 +557,7 @@ def held(marks: Sequence[Mark]) -> Table:
 def critical(marks: Sequence[Mark]) -> Table:
     """Return how far the critical loads of the models are off those of the truth, beyond the velocities of the recordings."""
     columns = (
-        Column("answers"), Column("cases"), Column("median", format=".3g"), Column("q90", format=".3g"),
+        Column("answers", ""), Column("cases"), Column("median", format=".3g"), Column("q90", format=".3g"),
         Column("baseline_median", format=".3g"), Column("baseline_q90", format=".3g"), Column("nearer", format=".3f"),
     )  # fmt: skip
     rows = []
@@ -576,7 +576,7 @@ def critical(marks: Sequence[Mark]) -> Table:
 def sizes(marks: Sequence[Mark]) -> Table:
     """Return how well the sizes of rightly named effects, and their standard errors, hold."""
     columns = (
-        Column("tracks"), Column("within_2", about="no more than 2 standard errors off"), Column("cases"), *SHARE_COLUMNS,
+        Column("tracks", ""), Column("within_2", about="no more than 2 standard errors off"), Column("cases"), *SHARE_COLUMNS,
         Column("median_off", about="median of the distance, in standard errors", format=".2f"),
         Column("median_relative", about="the same, relative to the size", format=".3f"),
     )  # fmt: skip
@@ -605,10 +605,11 @@ def cost(marks: Sequence[Mark]) -> Table:
 
 
 CASES = (
-    Column("case"), Column("kind"), Column("concealed"), Column("rough"), Column("invisible"), Column("sigmas", format=".3g"),
-    Column("size", format=".3g"), Column("verdict"), Column("effects"), Column("stated", format=".3f"), Column("top"),
-    Column("top_stated", format=".3f"), Column("right"), Column("class_right"), Column("error", format=".3f"),
-    Column("baseline_error", format=".3f"), Column("cpu", "s", format=".1f"), Column("failure"),
+    Column("case", ""), Column("kind", ""), Column("concealed", ""), Column("rough", ""), Column("invisible"),
+    Column("sigmas", format=".3g"), Column("size", format=".3g"), Column("verdict", ""), Column("effects", ""),
+    Column("stated", format=".3f"), Column("top", ""), Column("top_stated", format=".3f"), Column("right"),
+    Column("class_right"), Column("error", format=".3f"), Column("baseline_error", format=".3f"),
+    Column("cpu", "s", format=".1f"), Column("failure", ""),
 )  # fmt: skip
 
 
@@ -741,7 +742,7 @@ JUDGES: tuple[tuple[str, Judge], ...] = (
 def ablated(marks: Sequence[Mark]) -> Table:
     """Return the main rates of the verdicts, and of what would have been said without a gate."""
     columns = (
-        Column("judged"), Column("cases"), Column("right", format=".3f"),
+        Column("judged", ""), Column("cases"), Column("right", format=".3f"),
         Column("false_alarms", about="where nothing is concealed", format=".3f"),
         Column("wrong_names", about="share of all cases", format=".3f"),
         Column("unknown_recognised", format=".3f"),
