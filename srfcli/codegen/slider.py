@@ -6,18 +6,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from numpy.typing import NDArray
 
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.core.errors import SrfError, as_names
 from srfcli.core.settings import DEFAULTS, Parameter, Resolved, resolve
 from srfcli.laws.registry import Registry, chosen_instead, load_registry
-from srfcli.laws.values import Effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from srfcli.laws.values import Law
+from srfcli.laws.values import Effect, Law
 
 
 @dataclass(frozen=True)

@@ -215,8 +215,8 @@ def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
     kinds = {h: _kind_of_unit(unit) for h, unit in units_of.items()}
     free = [h for h in kinds if not words[h] & ASIDE]
     for role, (known, units) in WORDS.items():
-        if _played(role, found):
-            continue
+        if role in found or any(role in same and {*same} & found.keys() for same in (DRIVES, LOADS, OBSERVED)):
+            continue  # it, or another that makes it needless, is found already
         # a unit that is not told will do for a role that is told by a number without one
         fit = [h for h in free if kinds[h] in units or (kinds[h] == "" and role == "time")]
         score = {h: len(words[h] & known) for h in fit}
@@ -231,12 +231,6 @@ def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
             actual = FORCE_OF_STRESS.get(role, role) if kinds[heading] in ("N", "N*um") else role
             found[actual] = Named(actual, heading, units_of[heading] or ROLES[actual], True, units_of[heading] is None)
             free.remove(heading)
-
-
-def _played(role: str, found: Mapping[str, Named]) -> bool:
-    """Return whether a role, or another that makes it needless, is found already."""
-    same = (set(DRIVES), set(LOADS), set(OBSERVED))
-    return any(role in group and group & set(found) for group in same) or role in found
 
 
 def _kind_of_unit(unit: str | None) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.data.values import CriticalLoads, Run, per_elongation
 from srfcli.diagnosis.design import DiscriminatingRun, described
-from srfcli.diagnosis.discrepancy import RunForce, unexplained_friction
+from srfcli.diagnosis.discrepancy import unexplained_friction
 from srfcli.diagnosis.residual_scan import Location, Row
 from srfcli.diagnosis.verdict import Diagnosis, parameters_of
 from srfcli.inference.prediction import of_run
@@ -174,7 +174,8 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
             "baseline": v.baseline, "augmented": v.augmented, "noise_level": v.noise, "V": v.run.drive(v.run.t),
             "W": v.run.load(v.run.t)[0], "slip": v.slip, "windows": windows.get(v.run.name, []),
             "observable": v.run.observable, "rms": list(v.rms), "modulation": of_run(v.run), "white": list(v.white),
-            "friction": [_force_of(found.get(v.run.name), v.run) for found in friction],
+            "friction": [None if v.run.holdout else found[v.run.name].force if v.run.name in found else np.zeros(v.run.t.size)
+                         for found in friction],  # what a model leaves to its field
         })  # fmt: skip
     tables = [
         {"name": v.name, "holdout": v.holdout, "table": v.loads.table, "baseline": v.baseline, "augmented": v.augmented,
@@ -191,15 +192,11 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
         "residual_scan": [scan_row(row) for row in location.rows],
         "ranked": ranked_rows(diagnosis),
         "parameters": parameter_rows(diagnosis),
-        "scores": score_rows(diagnosis),
+        "scores": [
+            {"effect": s.effect.name} | {key: getattr(s, key) for key in ("gain", "size", "stderr", "tolerance", "detectable")}
+            for s in diagnosis.scores
+        ],
     }
-
-
-def _force_of(force: RunForce | None, run: Run) -> Array | None:
-    """Return the friction that a model leaves to its field along a run; zero on a smooth track, None of a held-out run."""
-    if run.holdout:
-        return None
-    return np.zeros(run.t.size) if force is None else force.force
 
 
 def scan_row(row: Row) -> dict[str, Any]:
@@ -236,12 +233,3 @@ def parameter_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         row["shift_sigma"] = (a["value"] - b["value"]) / b["stderr"] if a and b and b["stderr"] > 0 else None
         rows.append(row)
     return rows
-
-
-def score_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return what each effect could still explain, at first order."""
-    return [
-        {"effect": s.effect.name, "gain": s.gain, "size": s.size, "stderr": s.stderr, "tolerance": s.tolerance,
-         "detectable": s.detectable}
-        for s in diagnosis.scores
-    ]  # fmt: skip

@@ -238,11 +238,6 @@ class ClosedForm:
     held: tuple[Held, ...] = field(repr=False)
 
     @property
-    def held_gain(self) -> float | None:
-        """Return the gain in log likelihood over the baseline in held-out runs; None without any."""
-        return sum(h.gain for h in self.held) if self.held else None
-
-    @property
     def text(self) -> str:
         """Return the form in one line, with its coefficients and their standard errors."""
         formulas = [f"{slot} = {formula_text(formula)}" for slot, formula in self.formulas().items()]
@@ -283,7 +278,7 @@ class ClosedForm:
         return {
             "form": self.text,
             "gain": self.gain,
-            "held_gain": self.held_gain,
+            "held_gain": sum(h.gain for h in self.held) if self.held else None,
             "terms": [t.described() for t in self.terms],
             "beside": [e.name for e in self.beside],
             "rms_over_noise": self.fitted.fit.maximum.point.rms,

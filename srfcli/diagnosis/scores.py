@@ -237,12 +237,14 @@ class Scores:
         along = [e for e in candidates if e.name in shapes]
         if along:
             found += self._along(along, shapes)
-        found += [c for e in candidates if "K" in e.frees for c in self._freed(e)]
-        found += [_Column(e, e.sizes[0], {}, self._lagging()) for e in candidates if e.observed]
+        if freed := [e for e in candidates if "K" in e.frees]:
+            values = {"K": self.experiment.stiffness, **self.fitted.values}
+            columns = self._columns(self.fitted.likelihood.problem.model, (), values, ["K"])
+            found += [_Column(e, "K", {}, columns) for e in freed]
+        if late := [e for e in candidates if e.observed]:  # of first order in the delay a gauge shows less by what u gained in it
+            columns = self.remainder.padded([_carried(f, self.fitted, (), late=True) for f in self.remainder.runs])
+            found += [_Column(e, e.sizes[0], {}, columns) for e in late]
         return found
-
-    def _model(self, added: Sequence[Effect]) -> GeneratedModel:
-        return self._opened(added, stability=not self.experiment.runs)
 
     def _opened(self, added: Sequence[Effect], *, stability: bool) -> GeneratedModel:
         choice = self.experiment.choice.plus(e.name for e in (*self.present, *added))
@@ -299,7 +301,7 @@ class Scores:
         if not effects:
             return []
         try:
-            model = self._model(effects)
+            model = self._opened(effects, stability=not self.experiment.runs)
         except SrfError as error:
             if len(effects) == 1:
                 self.excluded.append(Excluded(effects[0].reported, error.message))
@@ -324,16 +326,6 @@ class Scores:
                 made.append(_Column(e, e.sizes[0], group[0], block))
                 at += len(group)
         return made
-
-    def _freed(self, effect: Effect) -> list[_Column]:
-        values = {"K": self.experiment.stiffness, **self.fitted.values}
-        columns = self._columns(self.fitted.likelihood.problem.model, (), values, ["K"])
-        return [_Column(effect, "K", {}, columns)]
-
-    def _lagging(self) -> Array:
-        """Return the column of a gauge that follows late: of first order in the delay, it shows less by what u gained in it."""
-        blocks = [_carried(f, self.fitted, (), late=True) for f in self.remainder.runs]
-        return self.remainder.padded(blocks)
 
     def _along(self, effects: Sequence[Effect], shapes: Mapping[str, Shape]) -> list[_Column]:
         """Return the columns of effects that are functions of slip, time or stage position, for all inner values."""

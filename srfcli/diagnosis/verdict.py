@@ -450,11 +450,6 @@ def parameters_of(fitted: Fitted) -> dict[str, dict[str, Any]]:
     return found
 
 
-def brought(diagnosis: Diagnosis) -> Mapping[str, Mapping[str, Any]]:
-    """Return the parameters that the final model adds to the baseline's."""
-    return added(diagnosis.final, diagnosis.baseline)
-
-
 def added(fitted: Fitted, baseline: Fitted) -> dict[str, dict[str, Any]]:
     """Return the parameters that a model has and the baseline has not, those of single runs left out."""
     own = {q.name for q in baseline.fit.likelihood.problem.experiment.parameters}

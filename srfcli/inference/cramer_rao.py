@@ -133,7 +133,8 @@ def _question(experiment: Experiment, checks: Sequence[RunCheck], registry: Regi
     choice, listed = experiment.choice, {q.name: q for q in experiment.parameters}
     values, spelled = {}, {}
     if choice.interface == "elastic":  # W/lambda is kappa0 (W/Wref)^n at n = 1
-        length = listed["lambda"].value if "lambda" in listed else _default(registry, "elastic", "lambda")
+        usual = next(to_base(p.default, p.unit) for p in registry.get("interface", "elastic").parameters if p.name == "lambda")
+        length = listed["lambda"].value if "lambda" in listed else usual
         Wref = float(np.mean([c.load.mean for c in checks]))
         choice, spelled = replace(choice, interface="power"), {"lambda": "kappa0"}
         values = {"kappa0": Wref / length, "Wref": Wref, "n": 1.0}
@@ -153,10 +154,6 @@ def _question(experiment: Experiment, checks: Sequence[RunCheck], registry: Regi
         free, widths = (*free, "K"), {**widths, "K": STIFFER * checks[0].run.stiffness / share}
     free = tuple(n for n in free if n in model.names)
     return _Question(model, experiment, values, asked, free, widths, (experiment.trend or "slip") if apparatus else None)
-
-
-def _default(registry: Registry, interface: str, name: str) -> float:
-    return next(to_base(p.default, p.unit) for p in registry.get("interface", interface).parameters if p.name == name)
 
 
 def _width(lower: float, upper: float, value: float) -> float:

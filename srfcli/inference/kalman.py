@@ -61,11 +61,6 @@ class Signals:
     weighs: Array
     owner: tuple[int, ...]
 
-    @classmethod
-    def one(cls, n: int, processes: int) -> Signals:
-        """Return those of a run of one gauge."""
-        return cls(np.zeros(n, np.intc), np.full(n, GAUGE, np.intc), np.zeros(n), (0,) * processes)
-
 
 @dataclass(frozen=True)
 class Kept:
@@ -111,9 +106,9 @@ def kalman_filter(
     start: Dual,
     covariance: Dual,
     gauge: Dual,
-    order: Sequence[int] = (),
-    rate: NDArray[np.intc] | None = None,
-    signals: Signals | None = None,
+    order: Sequence[int],
+    rate: NDArray[np.intc],
+    signals: Signals,
     factor: Dual,
     offset: Dual,
     R: Dual,
@@ -128,8 +123,8 @@ def kalman_filter(
     A reading is `factor` (n,) times the elongation, or what else `signals` say it shows, plus `offset` (n,) plus gauge noise:
     white of variance `R` (n,), and processes of as many states as `order` (g,) says, 3 a signal at most. `gauge` (rates, g, 3)
     has their parameters: of one state, e' = -e/tau + s sqrt(2/tau) w, (tau, s, -); of two, an oscillator of frequency f (Hz),
-    quality q and standard deviation s, (f, s, q). `rate` (n,) says which row holds at a sample, the first if left out; where it
-    changes, a new noise begins.
+    quality q and standard deviation s, (f, s, q). `rate` (n,) says which row holds at a sample; where it changes, a new noise
+    begins.
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
     numbers in the same k directions. A reading moves ln v and ln PHI by no more than `farthest`, and the field by as many of its
     standard deviations, as what it says of them is linear: beside the fall of a stick-slip cycle that may be a velocity of any
@@ -143,12 +138,11 @@ def kalman_filter(
     if library is None:
         raise SrfError("the Kalman filter needs a C compiler", "Install one, or the package ziglang.")
     n, k, states = t.size, p.d.shape[-1], len(model.states)
-    signals = signals or Signals.one(n, len(order))
     if len(order) > GAUGE_PROCESSES * SIGNALS or signals.number.max() >= SIGNALS:
         raise SrfError(f"more than {GAUGE_PROCESSES} processes of gauge noise a signal, or more than {SIGNALS} signals")
     wide, own, owner = states + sum(order), *(np.array([*a, 0], dtype=np.intc) for a in (order, signals.owner))
     weighed = model.index("weighed") if "weighed" in model.names else -1
-    rates = np.ascontiguousarray(np.zeros(n) if rate is None else rate, dtype=np.intc)
+    rates = np.ascontiguousarray(rate, dtype=np.intc)
     number, shows = (np.ascontiguousarray(a, dtype=np.intc) for a in (signals.number, signals.shows))
     nu, S = np.full(n, np.nan), np.full(n, np.nan)
     nu_d, S_d = np.full((n, k), np.nan), np.full((n, k), np.nan)

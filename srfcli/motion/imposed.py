@@ -273,12 +273,9 @@ class SampledLoad(Load):
 
     def longest_step(self, start: float, end: float) -> float:
         if (start, end) not in self._longest:  # asked for at each evaluation of a likelihood
-            self._longest[start, end] = self._four_knots(start, end)
+            inside = self.knots[bisect_right(self._knots, start) - 1 : int(np.searchsorted(self.knots, end, side="left")) + 1]
+            self._longest[start, end] = float(4 * np.median(np.diff(inside))) if inside.size > 1 else math.inf
         return self._longest[start, end]
-
-    def _four_knots(self, start: float, end: float) -> float:
-        inside = self.knots[bisect_right(self._knots, start) - 1 : int(np.searchsorted(self.knots, end, side="left")) + 1]
-        return float(4 * np.median(np.diff(inside))) if inside.size > 1 else math.inf
 
     def check(self, start: float, end: float) -> None:
         if start < self._knots[0] or end > self._knots[-1]:

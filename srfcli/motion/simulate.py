@@ -183,7 +183,8 @@ def stick_slip(t: Array, u: Array, *, ripple: float | None = None, smallest: flo
         t, u = _averaged(t, u, ripple)
     if t.size < 5:
         return empty
-    threshold = max(EVENT_NOISE * _scatter(u), FLOOR * float(np.abs(u).max()) if smallest is None else smallest)
+    white = float(np.median(np.abs(np.diff(u, 3))) / (0.6745 * np.sqrt(20.0)))  # noise that scatters third differences as much
+    threshold = max(EVENT_NOISE * white, FLOOR * float(np.abs(u).max()) if smallest is None else smallest)
     found = _falls(u, threshold) if threshold > 0 else []
     if smallest is None and found:
         found = _falls(u, max(threshold, EVENT_DROP * _typical(u[[a for a, _ in found]] - u[[b for _, b in found]])))
@@ -199,11 +200,6 @@ def _typical(drops: Array) -> float:
     ranked = np.sort(drops)
     shares = np.cumsum(ranked**2)
     return float(ranked[np.searchsorted(shares, 0.5 * shares[-1])])
-
-
-def _scatter(u: Array) -> float:
-    """Return the standard deviation of white noise that would scatter third differences as much as `u` does."""
-    return float(np.median(np.abs(np.diff(u, 3))) / (0.6745 * np.sqrt(20.0)))
 
 
 def _averaged(t: Array, u: Array, frequency: float) -> tuple[Array, Array]:

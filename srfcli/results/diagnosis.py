@@ -16,9 +16,13 @@ import numpy as np
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
+from srfcli.data.values import Run
 from srfcli.diagnosis.answer import RunView, answer, load_views, material, parameter_rows, ranked_rows, run_views
 from srfcli.diagnosis.design import DiscriminatingRun, discriminating_files
-from srfcli.diagnosis.verdict import added, at_bounds
+from srfcli.diagnosis.residual_scan import Location
+from srfcli.diagnosis.search import Fitted
+from srfcli.diagnosis.verdict import Diagnosis, added, at_bounds
+from srfcli.laws.registry import Registry
 from srfcli.results.provenance import Provenance, write_result
 from srfcli.results.report_figures import loads_figure, run_figure, trace
 from srfcli.results.report_text import unit_text
@@ -28,11 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from srfcli.data.values import Run
-    from srfcli.diagnosis.residual_scan import Location
-    from srfcli.diagnosis.search import Fitted
-    from srfcli.diagnosis.verdict import Diagnosis
-    from srfcli.laws.registry import Registry
 
 ANSWER = "answer.json"
 LARGEST_ANSWER = 2**28  # bytes of an answer

@@ -14,11 +14,13 @@ import numpy as np
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
-from srfcli.data.values import BETWEEN_SAMPLES, told_of_runs
+from srfcli.data.thresholds import Thresholds
+from srfcli.data.values import BETWEEN_SAMPLES, Experiment, told_of_runs
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
+from srfcli.inference.fit import Fit, RunFit
 from srfcli.inference.noise import lag_one
-from srfcli.inference.posterior import not_quadratic
-from srfcli.inference.profile import FARTHER
+from srfcli.inference.posterior import Posterior, not_quadratic
+from srfcli.inference.profile import FARTHER, Interval
 from srfcli.inference.state_space import WIDE, typical_friction
 from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
@@ -30,11 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from srfcli.data.thresholds import Thresholds
-    from srfcli.data.values import Experiment
-    from srfcli.inference.fit import Fit, RunFit
-    from srfcli.inference.posterior import Posterior
-    from srfcli.inference.profile import Interval
     from srfcli.inference.recordings import RecordingFit
 PARAMETERS = (
     Column("parameter", "", "name"),

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.core.units import describe, find_unit
 from srfcli.numerics.compare import EXPERIMENT, LawStudy, Match, Observables, Window, changed_areas, contrast
 from srfcli.numerics.continuation import Boundary, crossing_numbers
 from srfcli.numerics.map import STABILITY_KINDS, StabilityMap, per_slip
 from srfcli.numerics.map_boundaries import map_notes, unexplained
+from srfcli.numerics.plane import MapAxis
 from srfcli.numerics.special_points import SpecialPoint, crossings_at
 from srfcli.results import plots
 from srfcli.results.stability import boundary_columns, boundary_row
@@ -27,9 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from srfcli.codegen.model import Array, GeneratedModel
     from srfcli.codegen.slider import SlidingSystem
-    from srfcli.numerics.plane import MapAxis
 
 PLACE = ("eps", "V", "K_over_W0", "W0")  # where a point lies; parameters along other axes stand after these
 GROWTH = {

@@ -10,10 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from srfcli.codegen.model import GeneratedModel
+from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.noise import measured
 from srfcli.data.values import AREA_GROWTH, OBSERVABLES, Declared, Experiment, Run, Signal
+from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.simulate import Trace, stick_slip
 from srfcli.results import plots
 from srfcli.results.figures import envelope
@@ -22,11 +26,6 @@ from srfcli.results.tables import Column, Result, Table, own_figure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
-
-    from srfcli.codegen.model import GeneratedModel
-    from srfcli.codegen.splines import Spline
-    from srfcli.motion.imposed import Drive, Load
 
     Array = NDArray
 

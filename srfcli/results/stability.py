@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from srfcli.codegen.model import GeneratedModel
 from srfcli.core.errors import Status, worst
 from srfcli.numerics.hopf import critical_point
 from srfcli.results import plots
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from srfcli.codegen.model import GeneratedModel
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.boundary import BoundaryPoint
     from srfcli.numerics.continuation import Boundary

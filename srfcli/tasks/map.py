@@ -8,7 +8,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from srfcli.codegen.model import GeneratedModel
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.parallel import Runner, run_here
 from srfcli.core.settings import require_parameter
@@ -35,9 +37,6 @@ from srfcli.numerics.special_points import SpecialPoint, branch_coefficients, cr
 from srfcli.results.map import ComparisonResult, MapResult
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from srfcli.codegen.model import GeneratedModel
     from srfcli.codegen.slider import SlidingSystem
 
 

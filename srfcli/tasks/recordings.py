@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from srfcli.core.errors import SrfError, Status, as_names, check_choice
 from srfcli.data import experiment as description
@@ -12,14 +11,12 @@ from srfcli.data.groups import BY
 from srfcli.data.values import Experiment
 from srfcli.inference import posterior as posteriors
 from srfcli.inference.cramer_rao import forecast
+from srfcli.inference.posterior import Posterior
+from srfcli.inference.profile import Interval
 from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import Registry, load_registry
 from srfcli.results.check import CheckResult
 from srfcli.results.fit import FitResult
-
-if TYPE_CHECKING:
-    from srfcli.inference.posterior import Posterior
-    from srfcli.inference.profile import Interval
 
 
 def read_experiment(

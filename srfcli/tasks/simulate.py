@@ -8,12 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from srfcli.codegen.model import Array, GeneratedModel, open_model
-from srfcli.codegen.slider import declared
+from srfcli.codegen.slider import SlidingSystem, declared
 from srfcli.codegen.splines import appended
 from srfcli.core.errors import SrfError, Status, did_you_mean, worst
 from srfcli.core.settings import Parameter, check_value, require_parameter
@@ -29,11 +30,6 @@ from srfcli.motion import STEP_RISE
 from srfcli.motion import simulate as integrate
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, ModulatedLoad, Modulation, SampledLoad
 from srfcli.results.simulation import Gauge, Job, Record, SimulationResult, Work, measure, observe
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from srfcli.codegen.slider import SlidingSystem
 
 LARGEST_VELOCITY = 1e9  # um/s
 

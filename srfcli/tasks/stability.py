@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srfcli.codegen.model import GeneratedModel
+from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, worst
 from srfcli.core.settings import check_value, require_parameter
 from srfcli.core.units import to_base
@@ -26,7 +26,6 @@ from srfcli.results.stability import (
 )
 
 if TYPE_CHECKING:
-    from srfcli.codegen.model import Array
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.continuation import Boundary, ContinuationSettings
     from srfcli.numerics.critical import CriticalLine, LoadWindow

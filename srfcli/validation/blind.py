@@ -175,7 +175,7 @@ OFF_RANGE = (0.1, 1 / 3, 3.0, 10.0)  # times the slowest, the fastest drive: whe
 def told(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
     """Return a diagnosis as an answer."""
     from srfcli.diagnosis.answer import run_views
-    from srfcli.diagnosis.verdict import brought
+    from srfcli.diagnosis.verdict import added
 
     views, confidence = run_views(diagnosis), dict[str, float]()
     for name, share in diagnosis.confidence.items():
@@ -187,7 +187,7 @@ def told(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
         confidence,
         tuple(tuple(names) for names in diagnosis.equivalent),
         tuple(dict.fromkeys(x.effect for x in diagnosis.not_identifiable)),
-        {name: {k: _finite(v) for k, v in value.items()} for name, value in brought(diagnosis).items()},
+        {name: {k: _finite(v) for k, v in value.items()} for name, value in added(diagnosis.final, diagnosis.baseline).items()},
         {"baseline": _finite(diagnosis.shown.fit.maximum.point.rms), "augmented": _finite(diagnosis.final.fit.maximum.point.rms)},
         {view.run.name: _errors(view) for view in views if view.holdout},
         {_plain(f.name): _evidence(f) for f in reversed(diagnosis.ranked)},
@@ -260,15 +260,11 @@ def code_of(plugins: tuple[Path, ...]) -> str:
     package = Path(__file__).resolve().parents[1]
     parts = [p for p in sorted(package.iterdir()) if p.name not in ELSEWHERE]
     whole = hashlib.sha256()
-    for path in _sources([*parts, package.parent / "plugins", *plugins]):
-        whole.update(path.name.encode() + path.read_bytes())
+    for place in (*parts, package.parent / "plugins", *plugins):
+        for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
+            if path.suffix in (".py", ".toml", ".c") and path.is_file():
+                whole.update(path.name.encode() + path.read_bytes())
     return whole.hexdigest()[:12]
-
-
-def _sources(places: Sequence[Path]) -> Iterator[Path]:
-    for place in places:
-        files = sorted(place.rglob("*")) if place.is_dir() else [place]
-        yield from (p for p in files if p.suffix in (".py", ".toml", ".c") and p.is_file())
 
 
 def _cpu() -> float:
