@@ -349,6 +349,18 @@ def test_a_lone_spike_on_a_constant_load_is_bridged(tmp_path: Path) -> None:
         assert isinstance(run.load, ConstantLoad) and run.load.W0 == 5.0
 
 
+def test_the_tail_of_a_load_s_noise_is_no_spike() -> None:
+    """A servo's noise has heavy tails: what stands out as others do is kept, a transducer's accident among it is bridged."""
+    t = np.arange(20_000) / 1000
+    place = Place(Path("x.csv"), "normal_stress", np.arange(1, t.size + 1), t)
+    noise = np.random.default_rng(3).standard_t(4, size=t.size)
+    W = 20 + 0.01 * noise
+    assert not [n for n in load_from_column(place, W)[1] if n.kind == "spike"]
+    W[7000] += 2.0
+    (told,) = [n for n in load_from_column(place, W)[1] if n.kind == "spike"]
+    assert told.what.startswith("1 sample ") and "row 7001," in told.where
+
+
 @pytest.mark.parametrize("per_period", [8, 12, 25])
 @pytest.mark.parametrize("amplitude", [0.045, 0.5])
 def test_a_modulation_that_begins_in_mid_record_is_no_row_of_spikes(per_period: int, amplitude: float) -> None:

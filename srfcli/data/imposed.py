@@ -18,7 +18,7 @@ from srfcli.core.units import is_stress
 from srfcli.data.clock import Place, kept_samples
 from srfcli.data.columns import DRIVES, MOST_BYTES, Columns, Finder, open_source
 from srfcli.data.description import RunDescription
-from srfcli.data.noise import NOISE_SAMPLES, quantisation, saturation, spikes, white_level
+from srfcli.data.noise import NOISE_SAMPLES, deviations, quantisation, saturation, spikes, white_level
 from srfcli.data.values import OBSERVABLES, Declared
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation, SampledLoad
@@ -695,6 +695,7 @@ NEGLIGIBLE = 1e-5  # of the load's range: noise below it is interpolated and not
 SELDOM = 100  # samples to each that differs from the one before, from which a load was set, and what is between has no noise
 LOAD_BLOCKS = 16  # whose means are compared to see whether a load is constant
 ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
+APART = 2.0  # times as far from its level as the next sample: a spike; the tail of a noise of 4 degrees of freedom has 7 %
 NO_CONTACT = 1e-15  # N: no contact
 SAMPLES_A_PERIOD = 8  # of a modulation, from which a column shows it to 1e-3 of its amplitude
 SMALLEST_MODULATION = 5e-4  # relative amplitude of a modulation, at least: a servo varies the load by less
@@ -759,6 +760,11 @@ def load_from_column(place: Place, W: Array, unit: str = "N") -> tuple[Load, lis
     bad = spikes(filled, min(quantisation(filled), least), least=least)  # a spike on a constant is a lattice of its own
     if bad.sum() > ACCIDENTS + W.size // 500:  # a modulation that begins in mid-record looks like this
         bad[:] = False
+    if bad.any():  # less is the tail of a noise: those that stand out, each no more than twice as far as the next
+        off = deviations(filled)
+        ranked = np.sort(off)[::-1]
+        count = np.flatnonzero((ranked[:-1] >= APART * ranked[1:]) & (np.arange(1, off.size) <= bad.sum()))
+        bad &= off >= ranked[count[-1]] if count.size else False
     notices += place.spots("spike", bad, f"standing out in '{place.heading}'; the load is bridged")
     good = known & ~bad
     filled = np.interp(t, t[good], filled[good])

@@ -111,6 +111,14 @@ def local_scale(x: Array, m: Array) -> Array:
     return np.asarray(2.0 * np.maximum(near, 0.5 * overall))  # the running median follows the noise by a quarter
 
 
+def deviations(x: Array) -> Array:
+    """Return how far each sample of x (n,) is off its running median, in robust standard deviations near it."""
+    from scipy.ndimage import median_filter
+
+    level = median_filter(x, size=SIDE, mode="nearest")
+    return np.abs(x - level) / np.maximum(local_scale(x, level), np.spacing(np.abs(x).max()))
+
+
 def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: float = 0.0) -> Mask:
     """Return which samples of x (n,) are spikes: up to three that stand out from both sides, with the same level after them.
 
