@@ -32,9 +32,9 @@ def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.nda
     return J @ [1.0, -2.0] + C @ c + rng.normal(size=n), J, C, track
 
 
-def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, roughness: FieldPrior) -> float:
+def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, field: FieldPrior) -> float:
     """The log likelihood with parameters and track integrated out, from the covariance of all samples."""
-    L = roughness.root(track.nodes) if roughness.amplitude else np.zeros((track.coefficients.size, 1))
+    L = field.root(track.nodes) if field.amplitude else np.zeros((track.coefficients.size, 1))
     S = np.eye(r.size) + C @ L @ L.T @ C.T
     W = np.linalg.solve(S, np.column_stack([J, r]))
     rest = r - J @ np.linalg.solve(J.T @ W[:, :2], J.T @ W[:, 2])
@@ -49,20 +49,20 @@ def _marginal(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, **grid
 
 def test_marginal_likelihood_is_that_of_the_whole_covariance() -> None:
     problem = _linear(1e-4, 1)
-    found, roughness = _marginal(*problem)
+    found, field = _marginal(*problem)
     best = max(_whole(*problem, FieldPrior(a, length)) for length in LENGTHS for a in AMPLITUDES)
     assert found == pytest.approx(best, abs=1e-5)
-    assert 0.3e-4 < roughness.amplitude < 3e-4
+    assert 0.3e-4 < field.amplitude < 3e-4
 
 
 @pytest.mark.parametrize("own", [FieldPrior(5e-4, 6.0), FieldPrior(2e-5, 0.5)], ids=["coarse", "finer than its knots"])
-def test_marginal_likelihood_of_one_roughness_is_its_own_and_not_a_better_one_s(own: FieldPrior) -> None:
+def test_marginal_likelihood_of_one_field_is_its_own_and_not_a_better_one_s(own: FieldPrior) -> None:
     problem = _linear(1e-4, 1)
     found = _marginal(*problem, grid=(np.array([own.length]), np.array([own.amplitude])))
     assert found == (pytest.approx(_whole(*problem, own), abs=1e-5), own)
 
 
-def test_no_roughness_is_found_where_there_is_none() -> None:
+def test_no_field_is_found_where_there_is_none() -> None:
     problem = _linear(0.0, 2)
     found, _ = _marginal(*problem)
     assert found - _whole(*problem, FieldPrior()) < 4.0

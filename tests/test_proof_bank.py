@@ -330,7 +330,7 @@ def test_a_bank_is_sealed_and_opens(bank, tmp_path):
     assert again.apart.read_bytes() == bank.apart.read_bytes()
 
 
-@pytest.mark.parametrize(("track", "rough", "own"), [("smooth", False, False), ("shared", True, False), ("own", True, True)])
+@pytest.mark.parametrize(("track", "rough", "own"), [("smooth", False, False), ("shared", True, False), ("rough", True, True)])
 def test_a_bank_is_on_the_tracks_that_are_asked_for(quick, tmp_path, track, rough, own):
     made = make_bank(tmp_path / "bank", 3, 1, strengths=False, track=track)
     truths = unseal(made.folder, made.apart).values()

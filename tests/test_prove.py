@@ -280,16 +280,16 @@ def test_tables_count_what_was_marked():
     marks = sample()
     first = rows(report.confusion(marks))
     assert {k: v["cases"] for k, v in first.items()} == {
-        "none": 1, "none, rough track": 1, "single": 2, "single, rough track": 1, "pair": 1, "outside": 2,
+        "none": 1, "none, one field for all runs": 1, "single": 2, "single, one field for all runs": 1, "pair": 1, "outside": 2,
     }  # fmt: skip
     assert (first["single"]["identified"], first["single"]["right"]) == (2, 1)
-    assert (first["single, rough track"]["right"], first["single, rough track"]["class_right"]) == (0, 1)
+    assert (first["single, one field for all runs"]["right"], first["single, one field for all runs"]["class_right"]) == (0, 1)
     found = {name: (row["hits"], row["cases"]) for name, row in rows(report.rates(marks)).items()}
     assert found["right"] == (3, 8)
     assert found["right, or ambiguous and listed"] == (4, 8)
-    assert (found["right, smooth tracks"], found["right, rough tracks"]) == ((3, 6), (0, 2))
+    assert (found["right, without a field"], found["right, with a field"]) == ((3, 6), (0, 2))
     assert found["false alarm where nothing is concealed"] == (1, 2)
-    assert (found["false alarm, smooth tracks"], found["false alarm, rough tracks"]) == ((0, 1), (1, 1))
+    assert (found["false alarm, without a field"], found["false alarm, with a field"]) == ((0, 1), (1, 1))
     assert (found["wrong name, stated above 0.9"], found["wrong name, of all names"]) == ((4, 8), (4, 5))
     assert found["unknown recognised"] == (1, 2)
     alone = rows(report.by_effect(marks))

@@ -25,13 +25,13 @@ srf prove --out proof                                      ten cases: a first lo
 srf prove --cases 200 --seed 4 --workers 0 --out proof     two hundred cases on all cores
 srf prove --out proof --resume                             go on with what was interrupted
 srf prove --cases 40 --kind none --out nulls               false alarms alone
-srf prove --cases 40 --track own --out rough               every run on a rough track of its own
+srf prove --cases 40 --track rough --out rough             a random friction field of each run's own
 srf prove --bank wide --cases 60 --workers 0 --out wide    rock, micro-tribometers, other laws, protocols and noise, too
 srf prove --report-only proof --json | jq .meta.rates      the tables again
 """
 KINDS = ("none", "single", "pair", "outside", "ageing", "one-run")
 BANKS = ("paper", "wide")
-TRACKS = ("smooth", "shared", "own")
+TRACKS = ("smooth", "rough", "shared")
 
 
 @click.command("prove", cls=SrfCommand, epilog=EXAMPLES)

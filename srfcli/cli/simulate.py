@@ -32,7 +32,7 @@ srf simulate --V 8 --load '2:5, 0.2:5->7, 4:7' --csv
 srf simulate --drive '0.5:12, 4:8' --W0 9 --eps 0.09 --onset 2 --noise 0.02 --lag1 0.8 --quantum 0.005 --out-dir made
 srf simulate EXPERIMENT --run onset --plot onset.svg
 srf simulate EXPERIMENT --set lambda=0.5 --out-dir predicted
-srf simulate EXPERIMENT --roughness 3e-4 --roughness-length 10 --seed 1 --out-dir rough
+srf simulate EXPERIMENT --field 3e-4 --field-length 10 --seed 1 --out-dir made
 """
 OWN_RECORD = {  # options that describe a new record; they exclude EXPERIMENT, which has its own
     "V": "--V", "W0": "--W0", "eps": "--eps", "drive": "--drive", "load": "--load", "load_file": "--load-file",
@@ -84,8 +84,8 @@ EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load
 )
 @click.option("--lag1", default=0.0, show_default=False, help="Correlation of the noise from sample to sample, as 0.8.")
 @click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded.")
-@click.option("--roughness", metavar="SIZE", help="Standard deviation of a random friction field along slip, as 3e-4.")
-@click.option("--roughness-length", metavar="UM", help="Correlation length of that field, in um.  [default: 10 um]")
+@click.option("--field", metavar="SIZE", help="Amplitude of a random friction field along slip, in units of mu0, as 3e-4.")
+@click.option("--field-length", metavar="UM", help="Correlation length of that field, in um.  [default: 10 um]")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of all that is random.")
 @click.option(
     "--out-dir",
@@ -228,7 +228,7 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], field: Friction
     values, folder = slider.resolved.values, given["folder"]
     observables = task.check_observables([n.strip() for n in (given["observable"] or "elongation").split(",")])
     if field is not None and system.chosen["loading"].value != "vertical":
-        raise SrfError("a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined.")
+        raise SrfError("a random friction field is for a slider loaded from above", "Leave out --field or --loading inclined.")
     if folder is not None and system.chosen["loading"].value != "vertical":
         raise SrfError("an experiment folder cannot say that the spring is inclined", "Leave out --out-dir or --loading.")
     load: Load = ConstantLoad(values["W0"])
@@ -256,7 +256,7 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], field: Friction
         onset=None if given["onset"] is None else parse_quantity(given["onset"], "s", name="--onset"),
         start=given["start"],
         observables=observables,
-        rough=None if field is None else (system.model(tables=task.FIELD_TABLE), field),
+        on=None if field is None else (system.model(tables=task.FIELD_TABLE), field),
     )
     gauges = task.read_gauges(observables, **{key: given[key] for key in ("noise", "lag1", "quantum", "seed")})
     choice, made = _laws(system), None
@@ -338,7 +338,7 @@ def _placed(names: Sequence[str]) -> tuple[str, ...]:
 
 TRAVEL = 40.0  # um of driving where no duration is given
 LONGEST_TIME = 1e12  # s
-ROUGHNESS_LENGTH = 10.0  # um, the correlation length where only a size is given
+FIELD_LENGTH = 10.0  # um, the correlation length where only a size is given
 
 Piece = tuple[float, float, float]  # duration (s), and the values between which a quantity runs straight
 
@@ -397,23 +397,23 @@ def parse_spread(text: str) -> float:
 
 
 def read_field(given: Mapping[str, Any]) -> FrictionField | None:
-    """Return the random field that --roughness, --roughness-length and --seed describe; None without one."""
-    if given["roughness"] is None:
-        if given["roughness_length"] is not None:
-            raise SrfError("--roughness-length is given and the track is smooth", "Give the size: --roughness 3e-4.")
+    """Return the random field that --field, --field-length and --seed describe; None without one."""
+    if given["field"] is None:
+        if given["field_length"] is not None:
+            raise SrfError("--field-length is given without a field", "Give the size: --field 3e-4.")
         return None
     from srfcli.data.noise import FrictionField
 
-    size = parse_quantity(given["roughness"], "1", name="--roughness")
-    length = parse_quantity(given["roughness_length"] or str(ROUGHNESS_LENGTH), "um", name="--roughness-length")
+    size = parse_quantity(given["field"], "1", name="--field")
+    length = parse_quantity(given["field_length"] or str(FIELD_LENGTH), "um", name="--field-length")
     field = FrictionField(size, length, given["seed"])
     return field if field.amplitude else None
 
 
 def _field_parameters(field: FrictionField, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the field's amplitude and correlation length as described parameters."""
-    origin = "default" if given["roughness_length"] is None else "flag"
+    origin = "default" if given["field_length"] is None else "flag"
     return {
-        "roughness": {"value": field.amplitude, "unit": "1", "origin": "flag"},
-        "roughness_length": {"value": field.length, "unit": "um", "origin": origin},
+        "field_amplitude": {"value": field.amplitude, "unit": "1", "origin": "flag"},
+        "field_length": {"value": field.length, "unit": "um", "origin": origin},
     }

@@ -350,11 +350,11 @@ class FrictionField:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.amplitude) and self.amplitude >= 0):
-            raise SrfError(f"a roughness of {self.amplitude:g} is not a size", "give it as 0 or more, as 3e-4")
+            raise SrfError(f"a field of {self.amplitude:g} is not a size", "give it as 0 or more, as 3e-4")
         shortest = KNOTS * FINEST_KNOTS
         if not (math.isfinite(self.length) and self.length >= shortest * (1 - 1e-12)):
             raise SrfError(
-                f"a roughness length of {self.length:g} um is finer than knots {FINEST_KNOTS:g} um apart can show",
+                f"a field length of {self.length:g} um is finer than knots {FINEST_KNOTS:g} um apart can show",
                 f"give {shortest:g} um or more",
             )
 
@@ -372,7 +372,7 @@ class FrictionField:
         if not max(abs(low), abs(high)) < most * h:
             raise SrfError(
                 f"a track to position {max(abs(low), abs(high)):g} um, in steps of {h:g} um, has more than {most} knots",
-                "shorten the record, or give a longer roughness length",
+                "shorten the record, or give a longer field length",
             )
         first, last = math.floor(low / h), math.ceil(high / h)
         first -= first * h > low  # as the quotient is rounded, and the spline's end

@@ -6,7 +6,7 @@ alpha = 0 and n = 1; the derivatives of the observable, whitened with the noise 
 error is the Cramer-Rao bound with the experiment's free parameters unknown within their bounds, and with them what a laboratory
 does not know either: the machine's stiffness, within a factor of two, and a trend of each run with slip. The noise's level and
 colour may be unknown, too: of Gaussian noise their information and that of the mean are apart, so that it costs nothing. A fit
-of these recordings by this model cannot do better. A rough track, or start values that are far off, make it worse.
+of these recordings by this model cannot do better. A random friction field, or start values that are far off, make it worse.
 """
 
 from __future__ import annotations

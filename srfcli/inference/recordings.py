@@ -222,7 +222,7 @@ def fit_from_several(
     return Several(best, rows, interrupted)
 
 
-# Whether the runs slid on one and the same rough track.
+# Whether all runs have one and the same random friction field.
 
 ALIKE_FIELDS = 0.5  # mean correlation of the fields of two runs from which one field for all is fitted
 

@@ -25,14 +25,14 @@ KNOT_SPACING = 0.8  # um between knots: contacts are renewed over half of it, an
 MOST_KNOTS = 300  # coefficients of a track: a longer one has wider knots
 AMPLITUDES = np.array([0.0, *np.geomspace(2e-5, 3e-3, 12)])
 LENGTHS = np.geomspace(1.0, 30.0, 6)
-GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the roughness that are tried
-FIELD_ROUNDS = 4  # of roughness, parameters and noise in turn
+GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the field that are tried
+FIELD_ROUNDS = 4  # of field, parameters and noise in turn
 ROUNDS_AGREE = 0.5  # in log likelihood, between two rounds that agree
 MOST_STEPS = 25
 LEAST_GAIN = 0.02  # gain of twice the log likelihood below which the minimum is reached
-EARLY_GAIN = 2.0  # the same while roughness and noise still change
+EARLY_GAIN = 2.0  # the same while field and noise still change
 FAR_GAINS = ((1.5, 1e-6), (4.0, 1e-4), (np.inf, 1e-2))  # of chi-squared, the same up to so many times the samples
-ROUGHLY = 6.0  # chi-squared per sample within which roughness is estimated: farther off it would take up what is not its own
+ROUGHLY = 6.0  # chi-squared per sample within which the field is estimated: farther off it would take up what is not its own
 UNREACHED = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
 OVERFLOWN_SLOPE = 1e100  # a slope that is no slope any more: its square would overflow
 
@@ -65,10 +65,10 @@ class SharedFit:
 def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] = lambda text: None) -> SharedFit:
     """Return the fit in which mu0 wanders along one track that all runs share, from where another fit stands.
 
-    The problem's model has the table ("mu", "slip"). Noise, roughness and parameters are estimated in turn until they agree.
+    The problem's model has the table ("mu", "slip"). Noise, field and parameters are estimated in turn until they agree.
     Held-out runs are judged on that track.
     """
-    progress("one rough track for all runs")
+    progress("one random friction field for all runs")
     likelihood, noise = SharedLikelihood(problem), {r.name: Noise(r.noise.level) for r in begun.runs if not r.holdout}
     theta = np.array([begun.values[name] for name in problem.names])
     point, before = likelihood.at(theta, _track(problem.runs), noise, FieldPrior()), -np.inf
@@ -172,7 +172,7 @@ class SharedLikelihood:
         return Point(theta, track, prior, found, N, g, chi2, total)
 
     def minimise(self, point: Point, noise: Mapping[str, Noise], *, settled: float = LEAST_GAIN) -> Point:
-        """Return the most probable parameters and numbers under this noise and roughness, by Levenberg and Marquardt."""
+        """Return the most probable parameters and coefficients under this noise and field, by Levenberg and Marquardt."""
         problem, damping = self.problem, 0.0
         n, low, high = point.theta.size, problem.lower, problem.upper
         point = self.at(point.theta, point.track, noise, point.prior)
@@ -208,7 +208,7 @@ class SharedLikelihood:
         return max(settled, next(far for most, far in FAR_GAINS if share < most or most == np.inf) * point.chi2)
 
     def prior(self, point: Point) -> FieldPrior:
-        """Return the roughness at which the marginal likelihood is largest, the one so far where that means nothing."""
+        """Return the field at which the marginal likelihood is largest, the one so far where that means nothing."""
         if point.chi2 > ROUGHLY * self.samples:
             return point.prior if point.prior.amplitude else USUAL
         return marginal(point.N, point.g, point.theta.size, point.track, point.log_likelihood)[1]

@@ -236,7 +236,7 @@ def _told(forecast: Forecast) -> Table:
 def _errors(told: CramerRaoBound, name: str) -> tuple[str, str]:
     error = told.errors[name]
     if math.isinf(error):
-        return "untold", "-"
+        return "> 100", "-"
     return _percent(error) if name == "lambda" else f"{error:.2g}", str(rounded(told.peaks[name], 2))
 
 
@@ -312,8 +312,8 @@ def sentences(forecast: Forecast) -> list[str]:
     told += [_sentence(name, judge, forecast) for name in judge.errors]
     beside = f"with {', '.join(forecast.free)} unknown" if forecast.free else "with all else known"
     told.append(
-        f"at best: for the model and the start values of the experiment, {beside}, and the noise as found; a rough track, or "
-        "a model that fails, costs more"
+        f"at best: for the model and the start values of the experiment, {beside}, and the noise as found; "
+        "a random friction field, or a model that fails, costs more"
     )
     return told
 

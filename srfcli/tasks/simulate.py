@@ -197,11 +197,11 @@ def record_of(
     onset: float | None = None,
     start: ArrayLike | str | None = "steady",
     observables: Sequence[str] = ("elongation",),
-    rough: tuple[GeneratedModel, FrictionField] | None = None,
+    on: tuple[GeneratedModel, FrictionField] | None = None,
 ) -> Work:
     """Return one record of a slider, to be simulated; arguments are those of `simulate`.
 
-    `rough` is the model with FIELD_TABLE and the random field that it slides on.
+    `on` is the model with FIELD_TABLE and the random field that it slides on.
     """
     model, values, begin = system.motion, system.resolved.values, float(t[0])
     replaced = [name for name, given in (("V", drive), ("W0", load)) if given is not None]
@@ -230,7 +230,7 @@ def record_of(
         beside=tuple(observables[1:]),
     )  # fmt: skip
     work = Work(model, (job,), system.described(without=replaced))
-    return work if rough is None else on_field(work, *rough, start=start)
+    return work if on is None else on_field(work, *on, start=start)
 
 
 def _onset(onset: float | None, begin: float) -> float:
@@ -554,31 +554,31 @@ def _experiment_again(
 # The random friction field along slip, and records simulated with it.
 
 FIELD_TABLE = (("mu", "slip"),)  # a table over slip is added to the friction coefficient
-LARGEST_ROUGHNESS = 0.5  # of mu0: above it the friction coefficient may become negative
+LARGEST_FIELD = 0.5  # of mu0: above it the friction coefficient may become negative
 
 
-def on_field(work: Work, rough: GeneratedModel, field: FrictionField, *, start: ArrayLike | str | None) -> Work:
-    """Return work with its model replaced by `rough`, the same with FIELD_TABLE, each job on the part of the track it covers.
+def on_field(work: Work, model: GeneratedModel, field: FrictionField, *, start: ArrayLike | str | None) -> Work:
+    """Return work with its model replaced by `model`, the same with FIELD_TABLE, each job on the part of the track it covers.
 
     Positions are slip from where the run begins; runs that begin at the same place find the same track there. `start` is as in
-    `simulate`. Raises SrfError for a roughness that the friction coefficient does not allow.
+    `simulate`. Raises SrfError for a field that the friction coefficient does not allow.
     """
     jobs = []
     for job in work.jobs:
         begin, place = float(job.t[0]), job.run.start if job.run is not None else 0.0
-        p = rough.vector(dict(zip(work.model.names, job.p.tolist(), strict=True)) | {"start": place, "begin": begin})
-        mu0 = p[rough.index("mu0")] if "mu0" in rough.names else math.inf
-        if not field.amplitude <= LARGEST_ROUGHNESS * mu0:
+        p = model.vector(dict(zip(work.model.names, job.p.tolist(), strict=True)) | {"start": place, "begin": begin})
+        mu0 = p[model.index("mu0")] if "mu0" in model.names else math.inf
+        if not field.amplitude <= LARGEST_FIELD * mu0:
             raise SrfError(
-                f"`roughness` {field.amplitude:g} is more than half of mu0 = {mu0:g}",
+                f"a field of {field.amplitude:g} is more than half of mu0 = {mu0:g}",
                 "It is the standard deviation of mu0 along the track, such as 3e-4.",
             )
         table = field.spline(place, place + _reach(work.model, job))
-        state = start_state(rough, appended(p, [table]), start, drive=job.drive, load=job.load.rest(begin), begin=begin)
+        state = start_state(model, appended(p, [table]), start, drive=job.drive, load=job.load.rest(begin), begin=begin)
         jobs.append(replace(job, p=p, start=state, tables=(table,)))
     told = f"track: mu0 wanders by {field.amplitude:g} (standard deviation) over {field.length:g} um"
     meta = {**work.meta, "track": {"amplitude": field.amplitude, "length_um": field.length}}  # as in the result of `srf fit`
-    return replace(work, model=rough, jobs=tuple(jobs), notes=(*work.notes, told), meta=meta)
+    return replace(work, model=model, jobs=tuple(jobs), notes=(*work.notes, told), meta=meta)
 
 
 def _reach(model: GeneratedModel, job: Job) -> float:

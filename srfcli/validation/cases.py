@@ -167,7 +167,7 @@ def variants(name: str) -> tuple[Effect, ...]:
 KINDS = ("none", "single", "pair", "outside")
 WIDE_KINDS = (*KINDS, "ageing", "one-run")  # another ageing law is stated; an effect acts in one run
 BANKS = ("paper", "wide")
-TRACKS = {"smooth": (False, False), "shared": (True, False), "own": (True, True)}  # whether rough, and each run's own
+TRACKS = {"smooth": (False, False), "shared": (True, False), "rough": (True, True)}  # whether rough, and each run's own
 KIND_SHARES = (0.25, 0.4, 0.15, 0.2)  # of the kinds, where none is asked for
 WIDE_SHARES = (0.25, 0.3, 0.1, 0.13, 0.14, 0.08)
 START_SCATTER = {"A": 0.05, "B": 0.05, "D0": 0.05, "lam": 0.05, "Vsat": 0.13, "mu0": 0.01}  # relative standard deviations
@@ -175,7 +175,7 @@ ODD = ("rigid", "massless", "bare")  # baselines other than the usual one
 ODD_SHARE = 0.15  # of the cases where no effect decides it: else an odd baseline would give the answer away
 USUAL_ONLY = {"stiffness-exponent", "log-log-coupling", "interface-damping", "interface-compliance", "inertia", "age-saturation"}
 ROUGH_SHARE, WHITE_SHARE = 0.4, 0.6
-OWN_SHARE = 0.5  # of rough tracks: each run has its own
+OWN_SHARE = 0.5  # of cases with a field: each run has its own
 ROUGHNESS, CORRELATION = (5e-5, 4e-4), (3.0, 30.0)  # of mu0; um
 ROCK_CORRELATION = 10.0  # times as long, as are slip lengths and distances
 
@@ -216,7 +216,7 @@ class Asked:
     """What a case is asked to be; what is None is drawn.
 
     `size` from 0 to 1 is how strong the effects are, `rough` whether the track is, or the standard deviation of its mu0, `own`
-    whether each run has a rough track of its own.
+    whether each run has a field of its own.
     """
 
     kind: str | None = None
@@ -390,7 +390,7 @@ def _track(rng: np.random.Generator, rough: bool | float | None) -> Track:
     if rough is not None and not isinstance(rough, bool):
         size = float(rough)
         if not 0 <= size < 0.1:
-            raise SrfError(f"rough = {size:g} is no roughness of a track", "give the standard deviation of mu0, say 3e-4")
+            raise SrfError(f"rough = {size:g} is no amplitude of a field", "give the standard deviation of mu0, say 3e-4")
         is_rough = size > 0
     elif rough is not None:
         is_rough = rough

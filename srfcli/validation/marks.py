@@ -59,7 +59,7 @@ class Mark:
     held-out rms of the final model over that of the true one, `baseline_error` that of the baseline, `loads` how far the critical
     loads of both are off (rms of the logarithm), beyond the recordings' velocities; `deviation` is the
     distance of an effect's size from the true one, where it was named rightly and alone: in standard errors, and relative.
-    `own_track`: each run has a rough track of its own. `set_in` says in which apparatus, protocol, law, noise and field it was
+    `own_track`: each run has a friction field of its own. `set_in` says in which apparatus, protocol, law, noise and field it was
     concealed. `located`: of an effect in one run, whether it is named and most of the misfit is placed in that run.
     """
 
@@ -252,9 +252,9 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
     """Return how many standard errors an effect stands out of runs, with the baseline free and with it known.
 
     `sliders` are the runs and what is true in each. The baseline's parameters and the sizes of the `others` are free to first
-    order, from the slider without the effect. A rough track is taken as known: where it is not, less is seen. Where no mass is
-    known, a wrong stiffness does not stand out of elongations at all: they are those of mu0, A, B and M over the ratio and lambda
-    times it.
+    order, from the slider without the effect. A random friction field is taken as known: where it is not, less is
+    seen. Where no mass is known, a wrong stiffness does not stand out of elongations at all: they are those of mu0, A, B and M
+    over the ratio and lambda times it.
     """
     signals, tangents = [], []
     bare = {plan: effect.removed(p) for plan, p in sliders.items()}
@@ -384,7 +384,7 @@ def _cells(found: Rate) -> tuple[Any, ...]:
     return (found.hits, found.count, found.share, *found.interval)
 
 
-TRACKS = ((False, False, "smooth"), (True, False, "rough track"), (True, True, "a rough track of each run's own"))
+TRACKS = ((False, False, "smooth"), (True, False, "one field for all runs"), (True, True, "a field of each run's own"))
 
 
 def confusion(marks: Sequence[Mark]) -> Table:
@@ -413,13 +413,13 @@ def rates(marks: Sequence[Mark]) -> Table:
             rows.append((what, *_cells(rate(flag(m) for m in chosen)), aim or None))
 
     add("right", marks, lambda m: m.right, ">= 0.9")
-    add("right, smooth tracks", [m for m in marks if not m.rough], lambda m: m.right)
-    add("right, rough tracks", [m for m in marks if m.rough], lambda m: m.right)
+    add("right, without a field", [m for m in marks if not m.rough], lambda m: m.right)
+    add("right, with a field", [m for m in marks if m.rough], lambda m: m.right)
     add("right, a track of each run's own", [m for m in marks if m.own_track], lambda m: m.right)
     add("right, or ambiguous and listed", marks, lambda m: m.class_right)
     add("false alarm where nothing is concealed", none, lambda m: m.alarm, "< 0.05")
-    add("false alarm, smooth tracks", [m for m in none if not m.rough], lambda m: m.alarm)
-    add("false alarm, rough tracks", [m for m in none if m.rough], lambda m: m.alarm, "< 0.05")
+    add("false alarm, without a field", [m for m in none if not m.rough], lambda m: m.alarm)
+    add("false alarm, with a field", [m for m in none if m.rough], lambda m: m.alarm, "< 0.05")
     add(f"wrong name, stated above {CONFIDENT}", marks, lambda m: m.confident_wrong)
     add("wrong name, of all names", named, lambda m: m.wrong_name)
     ageing = [m for m in marks if m.kind == "ageing"]
@@ -504,7 +504,7 @@ def by_strength(marks: Sequence[Mark]) -> Table:
 
     add("standard errors", STANDS_OUT, lambda m: m.sigmas)
     add("drawn size", STRENGTHS, lambda m: m.size)
-    notes = ("standard errors: of its size, with the baseline free, the effect's form and a rough track known",
+    notes = ("standard errors: of its size, with the baseline free, the effect's form and a random friction field known",
              "drawn size: 0 weak to 1 strong, on a logarithmic scale")  # fmt: skip
     return Table("srf.prove.power/1", columns, rows, "Power: one effect concealed", notes if rows else ())
 
@@ -548,7 +548,7 @@ def held(marks: Sequence[Mark]) -> Table:
         if errors:
             ours, base = [e for e, _ in errors], [b for _, b in errors if b is not None]
             within = sum(e <= WITHIN for e in ours) / len(ours)
-            title = f"{name}, rough tracks" if rough else name
+            title = f"{name}, with a field" if rough else name
             rows.append((title, len(ours), quantile(ours, 0.5), quantile(ours, 0.9), within, quantile(base, 0.5)))
     note = "rms of held-out runs, over that of the model that knows the truth and the track; `within` 1.1 of it"
     return Table("srf.prove.held/1", columns, rows, "Held-out error", (note,) if rows else ())
@@ -586,7 +586,7 @@ def sizes(marks: Sequence[Mark]) -> Table:
         if found:
             off = [abs(sigmas) for sigmas, _ in found]
             medians = (quantile(off, 0.5), quantile([r for _, r in found], 0.5))
-            rows.append(("rough" if rough else "smooth", *_cells(rate(x <= 2 for x in off)), *medians))
+            rows.append(("one" if rough else "none", *_cells(rate(x <= 2 for x in off)), *medians))
     return Table("srf.prove.sizes/1", columns, rows, "Sizes of the effects that were named rightly, alone")
 
 
@@ -605,7 +605,7 @@ def cost(marks: Sequence[Mark]) -> Table:
 
 
 CASES = (
-    Column("case", ""), Column("kind", ""), Column("concealed", ""), Column("rough", ""), Column("invisible"),
+    Column("case", ""), Column("kind", ""), Column("concealed", ""), Column("field", ""), Column("invisible"),
     Column("sigmas", format=".3g"), Column("size", format=".3g"), Column("verdict", ""), Column("effects", ""),
     Column("stated", format=".3f"), Column("top", ""), Column("top_stated", format=".3f"), Column("right"),
     Column("class_right"), Column("error", format=".3f"), Column("baseline_error", format=".3f"),

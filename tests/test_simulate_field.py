@@ -1,4 +1,4 @@
-"""`srf simulate --roughness`: the random function itself, the motion over it, what is written, what is refused."""
+"""`srf simulate --field`: the random function itself, the motion over it, what is written, what is refused."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def test_motion_agrees_with_an_independent_generator(how: str, empty_folder: Pat
         pytest.skip("no C compiler")
     compiled.cache_clear(), compiler.cache_clear()
     try:
-        c = columns("--drive", "1:10, 1:20", "--W0", "5", "--rate", "100", "--roughness", "1e-3", "--roughness-length", "4",
+        c = columns("--drive", "1:10, 1:20", "--W0", "5", "--rate", "100", "--field", "1e-3", "--field-length", "4",
                     "--seed", "7")  # fmt: skip
     finally:
         compiled.cache_clear(), compiler.cache_clear()
@@ -173,7 +173,7 @@ def test_motion_agrees_with_an_independent_generator(how: str, empty_folder: Pat
 def test_slow_sliding_follows_the_track(flags: tuple[str, ...], empty_folder: Path) -> None:
     """Driven slowly against a long track the friction coefficient is that of steady sliding, plus the track where it is."""
     base = ("--V", "1", "--W0", "3", "--for", "30", "--rate", "10", *flags)
-    rough, smooth = columns(*base, "--roughness", "1e-3", "--roughness-length", "40", "--seed", "2"), columns(*base)
+    rough, smooth = columns(*base, "--field", "1e-3", "--field-length", "40", "--seed", "2"), columns(*base)
     slip = rough["t"] + rough["u"][0] - rough["u"]  # but for what the interface gives way
     track = FrictionField(1e-3, 40.0, 2).spline(0.0, 60.0)
     wander = rough["mu"] - smooth["mu"]
@@ -188,7 +188,7 @@ def test_runs_of_an_experiment_share_the_track_where_they_overlap(empty_folder: 
     block = text[text.index("[[runs]]") :]
     later = block.replace('"simulated"', '"later"').replace("holdout", "start = 15.0\nholdout")
     Path("made/experiment.toml").write_text(text + "\n" + block.replace('"simulated"', '"twin"') + "\n" + later)
-    gauge = ("--roughness", "5e-4", "--roughness-length", "6", "--seed", "3")
+    gauge = ("--field", "5e-4", "--field-length", "6", "--seed", "3")
     simulate("made", *gauge, "--out-dir", "rough")
     simulate("made", *gauge, "--run", "later", "--out-dir", "alone")
     first, twin, moved = read("rough").runs
@@ -202,7 +202,7 @@ def test_runs_of_an_experiment_share_the_track_where_they_overlap(empty_folder: 
 
 def test_a_track_under_any_program(empty_folder: Path) -> None:
     """A modulated and stepped load, holds, ramps and a start of one's own; the track takes part in what is steady at first."""
-    rough = ("--roughness", "2e-3", "--roughness-length", "5")
+    rough = ("--field", "2e-3", "--field-length", "5")
     c = columns("--drive", "0.5:10, 3:0, 1:2->20", "--load", "1:5, 3:7", "--eps", "0.05", "--rate", "200", *rough)
     assert np.isfinite(c["mu"]).all()
     here = FrictionField(2e-3, 5.0, 0).spline(0.0, 1.0)(np.array([0.0]))[0]
@@ -216,7 +216,7 @@ def test_a_recorded_load_over_a_rough_track(empty_folder: Path) -> None:
     rows = "\n".join(f"{t!r},{5 + 0.2 * math.sin(t)!r}" for t in (np.arange(400) / 100).tolist())
     Path("load.csv").write_text(f"time [s],normal_load [N]\n{rows}\n")
     rough, smooth = (columns("--V", "8", "--load-file", "load.csv", "--rate", "50", *more)
-                     for more in (("--roughness", "1e-3"), ()))  # fmt: skip
+                     for more in (("--field", "1e-3"), ()))  # fmt: skip
     assert np.array_equal(rough["W"], smooth["W"]) and 1e-3 < np.abs(rough["u"] - smooth["u"]).max() < 0.2
 
 
@@ -224,7 +224,7 @@ def test_a_recorded_load_over_a_rough_track(empty_folder: Path) -> None:
 
 
 def test_a_folder_reads_back_and_says_what_made_it(empty_folder: Path) -> None:
-    arguments = (*STEADY, "--roughness", "3e-4", "--seed", "4")
+    arguments = (*STEADY, "--field", "3e-4", "--seed", "4")
     c = columns(*arguments)
     done = simulate(*arguments, "--out-dir", "made", "--out", "t.json")
     assert "Note: track: mu0 wanders by 0.0003 (standard deviation) over 10 um" in done.stderr
@@ -236,27 +236,23 @@ def test_a_folder_reads_back_and_says_what_made_it(empty_folder: Path) -> None:
     table = json.loads(Path("t.json").read_text())
     assert side["seed"] == 4 and table["meta"]["track"] == {"amplitude": 3e-4, "length_um": 10.0}
     for told in (side["parameters"], table["parameters"]):
-        assert told["roughness"] == {"value": 3e-4, "unit": "1", "origin": "flag"}
-        assert told["roughness_length"] == {"value": 10.0, "unit": "um", "origin": "default"}
+        assert told["field_amplitude"] == {"value": 3e-4, "unit": "1", "origin": "flag"}
+        assert told["field_length"] == {"value": 10.0, "unit": "um", "origin": "default"}
         assert told["mu0"]["value"] == 0.33 and "start" not in told
     assert set(table["columns"]) == {"t", "V", "W", "u", "v", "phi", "mu", "tau"}
 
 
 def test_the_seed_makes_the_track_and_units_are_understood(empty_folder: Path) -> None:
     one, same, other = (
-        columns(*STEADY, "--roughness", "3e-4", "--roughness-length", length, "--seed", seed)["u"]
+        columns(*STEADY, "--field", "3e-4", "--field-length", length, "--seed", seed)["u"]
         for length, seed in (("2", "1"), ("2e-3 mm", "1"), ("2", "2"))
     )
     assert np.array_equal(one, same) and np.abs(one - other).max() > 1e-3
 
 
-def test_no_roughness_changes_no_byte(empty_folder: Path) -> None:
+def test_no_field_changes_no_byte(empty_folder: Path) -> None:
     arguments = ("--drive", "1:10, 1:20", "--W0", "5", "--rate", "100", "--noise", "0.02", "--seed", "2")
-    for folder, more in (
-        ("plain", ()),
-        ("zero", ("--roughness", "0")),
-        ("long", ("--roughness", "0", "--roughness-length", "3")),
-    ):
+    for folder, more in (("plain", ()), ("zero", ("--field", "0")), ("long", ("--field", "0", "--field-length", "3"))):
         simulate(*arguments, *more, "--out-dir", folder, "--out", f"{folder}.json")
         simulate("plain", *more, "--out-dir", f"{folder}-again")
     for name in ("zero", "long"):
@@ -298,18 +294,18 @@ def test_an_experiment_with_effects_is_simulated_as_it_is_fitted(
 @pytest.mark.parametrize(
     ("arguments", "message", "hint"),
     [
-        (["--roughness", "-1e-4"], "a roughness of -0.0001 is not a size", "0 or more"),
-        (["--roughness", "much"], "is not a number", "--roughness"),
-        (["--roughness", "1 um"], "measures", "plain number"),
-        (["--roughness", "0.17"], "more than half of mu0 = 0.33", "such as 3e-4"),
-        (["--roughness", "0.11", "--set", "mu0=0.2"], "more than half of mu0 = 0.2", "standard deviation"),
-        (["--roughness-length", "5"], "the track is smooth", "--roughness 3e-4"),
-        (["--roughness", "0", "--roughness-length", "-5"], "length of -5 um", "0.08 um or more"),
-        (["--roughness", "1e-4", "--roughness-length", "0"], "length of 0 um", "0.08 um or more"),
-        (["--roughness", "1e-4", "--roughness-length", "0.05"], "finer than knots 0.01 um apart", "0.08 um or more"),
-        (["--roughness", "1e-4", "--roughness-length", "5 s"], "measures", "um"),
-        (["--roughness", "1e-4", "--loading", "inclined"], "loaded from above", "--loading inclined"),
-        (["--roughness", "1e-4", "--roughness-length", "0.08", "--drive", "1e4:10"], "more than", "longer roughness"),
+        (["--field", "-1e-4"], "a field of -0.0001 is not a size", "0 or more"),
+        (["--field", "much"], "is not a number", "--field"),
+        (["--field", "1 um"], "measures", "plain number"),
+        (["--field", "0.17"], "more than half of mu0 = 0.33", "such as 3e-4"),
+        (["--field", "0.11", "--set", "mu0=0.2"], "more than half of mu0 = 0.2", "standard deviation"),
+        (["--field-length", "5"], "without a field", "--field 3e-4"),
+        (["--field", "0", "--field-length", "-5"], "length of -5 um", "0.08 um or more"),
+        (["--field", "1e-4", "--field-length", "0"], "length of 0 um", "0.08 um or more"),
+        (["--field", "1e-4", "--field-length", "0.05"], "finer than knots 0.01 um apart", "0.08 um or more"),
+        (["--field", "1e-4", "--field-length", "5 s"], "measures", "um"),
+        (["--field", "1e-4", "--loading", "inclined"], "loaded from above", "--loading inclined"),
+        (["--field", "1e-4", "--field-length", "0.08", "--drive", "1e4:10"], "more than", "longer field length"),
     ],
 )  # fmt: skip
 def test_errors_say_what_and_what_instead(arguments: list[str], message: str, hint: str, empty_folder: Path) -> None:
@@ -323,7 +319,7 @@ def test_errors_say_what_and_what_instead(arguments: list[str], message: str, hi
 def test_errors_about_an_experiment(empty_folder: Path) -> None:
     simulate(*STEADY, "--out-dir", "made")
     for arguments, message in (
-        (["--roughness", "0.2"], "more than half of mu0 = 0.33"),
-        (["--roughness-length", "5"], "the track is smooth"),
+        (["--field", "0.2"], "more than half of mu0 = 0.33"),
+        (["--field-length", "5"], "without a field"),
     ):
         assert message in simulate("made", *arguments, code=2).stderr
