@@ -63,7 +63,7 @@ def switches() -> list[click.Option]:
     """Return the options -q, -v, --debug and --trust; they set the session and are no argument of the command."""
     common: dict[str, Any] = {"expose_value": False, "callback": _switch, "is_eager": True}
     return [
-        click.Option(["-q", "--quiet"], is_flag=True, help="Print no progress and no notes.", **common),
+        click.Option(["-q", "--quiet"], is_flag=True, help="Print errors alone to stderr; notes below a table stay.", **common),
         click.Option(["-v", "--verbose"], count=True, show_default=False, help="Print more detail to stderr.", **common),
         click.Option(["--debug"], is_flag=True, help="Show the traceback of an error.", **common),
         click.Option(["--trust"], is_flag=True, help="Run Python that an experiment or srf.toml names.", **common),
@@ -283,7 +283,10 @@ def _usage_text(error: click.ClickException, group: click.Group, arguments: Sequ
     close = ["--free"] if name == "--fix" and "--free" in options else difflib.get_close_matches(name, options, n=1, cutoff=0.75)
     hints = [f"Did you mean '{close[0]}'?"] if close else []
     if "--set" in options and name.startswith("--") and name[2:].isidentifier():
-        hints.append(f"A law's parameter is set with --set {name[2:]}=VALUE.")
+        if name[2:] in ("V", "W0", "eps") and "--over" in options:
+            hints.append(f"Here it is swept: --over {name[2:]}=VALUE.")
+        else:
+            hints.append(f"A law's parameter is set with --set {name[2:]}=VALUE.")
     return f"no such option {name} of {path}", " ".join([*hints, f"The options are listed by {path} --help"])
 
 

@@ -51,24 +51,21 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
 @click.command("fit", cls=SrfCommand, epilog=EXAMPLES)
 @click.argument("sources", metavar="EXPERIMENT...|THRESHOLDS.csv", nargs=-1, required=True, type=PATH)
 @click.option(
-    "--table",
-    "place",
-    metavar="FILE.csv",
-    help="Fit each experiment by itself, and keep a row for each in this file, which is written as they are done.",
+    "--table", "place", metavar="FILE.csv", help="Fit each experiment by itself, and write a row for each to this file."
 )
 @click.option("--free", multiple=True, metavar="NAMES", help="Parameters to fit; else those that the experiment leaves free.")
-@click.option("--starts", type=click.IntRange(1, 1000), default=1, help="Starting points to fit from.")
+@click.option("--starts", type=click.IntRange(1, 1000), default=1, help="Starting points: the file's values, then others.")
 @click.option("--profile", is_flag=True, help="Profile-likelihood intervals.")
 @vary_options
 @click.option(
     "--prior/--no-prior",
     default=True,
-    help="Give what varies between five groups or more a Gaussian prior, of estimated mean and scatter.",
+    help="Whether values that vary between five groups or more have a Gaussian prior, its mean and scatter estimated.",
 )
 @click.option(
     "--track",
     type=click.Choice(["smooth", "rough", "shared"]),
-    help="Random friction field along slip: none, one for each run, one for all; else the recording decides.",
+    help="Random friction field along slip: none, one for each run, or one for all; unless given, the likeliest.",
 )
 @click.option("--sample", type=click.IntRange(100, 1_000_000), metavar="N", help="Draw N points of the posterior (emcee).")
 @click.option("--draws", metavar="FILE.nc", help="Keep the draws of --sample as ArviZ's netCDF.")
@@ -95,8 +92,9 @@ def command(
 
     The gauge's noise, its level and colour, and a random friction field along slip are estimated with the parameters and count
     in their errors. Several experiments, or --table, are a campaign: each is fitted by itself and has a row. A CSV file is taken
-    for a table of critical loads, which the paper's procedure fits. The options that choose a system, from --law to --effect but
-    for --plugins, are for such a table only: an experiment states its own.
+    for a table of critical loads, which the paper's procedure fits. The options that choose a system (--law, --ageing,
+    --interface, --loading, --inertia, --K, --M, --f, --angle, --set, --effect) are for such a table alone: an experiment states
+    its own system.
     """
     campaign, source = place is not None or len(sources) > 1, sources[0]
     if not campaign:

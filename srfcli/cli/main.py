@@ -66,7 +66,10 @@ COMMANDS = {
         "srfcli.cli.simulate:command",
         "Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding.",
     ),
-    "prove": ("srfcli.cli.prove:command", "Prove the diagnosis on experiments whose truth nobody has seen."),
+    "prove": (
+        "srfcli.cli.prove:command",
+        "Test the diagnosis on synthetic experiments whose truth is sealed until the last answer.",
+    ),
     "config": ("srfcli.cli.system:config", "Show which values are used, and where each comes from."),
 }
 

@@ -43,8 +43,8 @@ srf map --eps 0.4 --workers 8 --resume parts --out map.csv
 @click.option("--boundary", metavar="FILE", help="Write the polished points of the boundaries to FILE (.csv or .json).")
 @click.option("--boundaries/--no-boundaries", default=True, help="Whether boundaries are followed.")
 @click.option("--criticality/--no-criticality", default=True, help="Whether the normal form tells sub- from supercritical.")
-@click.option("--depth", type=click.IntRange(0, 10), default=4, help="How often a cell in which a boundary could hide is halved.")
-@click.option("--mesh-error", default=3e-4, help="What the map's mesh may shift a boundary by, relatively.")
+@click.option("--depth", type=click.IntRange(0, 10), default=4, help="Halvings of a cell that may contain a boundary.")
+@click.option("--mesh-error", default=3e-4, help="Largest relative shift of a boundary by an orbit's mesh.")
 @options.step_option
 @click.option("--tol", type=float, help="Relative error of each boundary point; 1e-6 unless set.")
 @options.mesh_option(least=64)
@@ -214,7 +214,7 @@ COMPARED_OPTIONS: options.Options = {  # those of `system_options`, but that sev
 @options.add_options(COMPARED_OPTIONS)
 @options.values_option(options.AMPLITUDE, default=(0.18,))
 @click.option("--at", default="10", metavar="V", help="Velocity (um/s) at which the laws are matched.")
-@click.option("--adjust", default="A,B,D0", help="The three parameters adjusted, with mu0 where there is one.")
+@click.option("--adjust", default="A,B,D0", metavar="A,B,D0", help="Three parameters that are adjusted, beside mu0.")
 @click.option("--match/--no-match", "matched", default=True, help="Whether parameters are adjusted at all.")
 @options.over_option(help="The window: V=LOW:HIGH[:POINTS] and K/W0=LOW:HIGH[:POINTS], each of which may be left out.")
 @options.worker_options

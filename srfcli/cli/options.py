@@ -384,7 +384,7 @@ SYSTEM_OPTIONS: Options = {
         multiple=True,
         metavar="DIR",
         type=click.Path(exists=True, path_type=Path),
-        help="Take laws from this folder, too.",
+        help="Folder with law files of your own; repeatable. Also SRF_PLUGINS.",
     ),
 }
 
@@ -444,11 +444,7 @@ def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str
 
 
 plugins_option = click.option(
-    "--plugins",
-    multiple=True,
-    metavar="DIR",
-    type=PATH,
-    help="Folder with law files of your own; may be given several times. Also SRF_PLUGINS.",
+    "--plugins", multiple=True, metavar="DIR", type=PATH, help="Folder with law files of your own; repeatable. Also SRF_PLUGINS."
 )
 
 
@@ -465,7 +461,7 @@ def mesh_option(*, least: int, most: int = 8192, default: int = 512) -> Callable
 
 def step_option(function: F) -> F:
     """Add --step, the longest step of a continuation; the command gets `step`."""
-    text = "Longest step, as a share of the window."
+    text = "Longest step along the curve, as a share of the window."
     return click.option("--step", default=0.035, help=text)(function)
 
 

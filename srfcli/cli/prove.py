@@ -36,7 +36,7 @@ TRACKS = ("smooth", "rough", "shared")
 
 @click.command("prove", cls=SrfCommand, epilog=EXAMPLES)
 @click.option("--cases", type=click.IntRange(1, 100_000), help="How many cases to make.  [default: 10]")
-@click.option("--seed", type=click.IntRange(0), help="Seed of the cases; keep it to yourself.  [default: 1]")
+@click.option("--seed", type=click.IntRange(0), help="Seed of the cases. Who knows it can compute the truths.  [default: 1]")
 @click.option(
     "--kind",
     "kinds",
@@ -80,7 +80,7 @@ def command(
     as_csv: bool,
     **asked: Any,
 ) -> None:
-    """Prove the diagnosis on experiments whose truth nobody has seen.
+    """Test the diagnosis on synthetic experiments whose truth is sealed until the last answer.
 
     Makes a bank of concealed cases by equations and a solver of its own, prints the digest of the truths, and diagnoses
     every case from its folder alone. When all are answered it verifies the seal, reads the truths, and prints what was

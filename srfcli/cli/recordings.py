@@ -39,7 +39,9 @@ KINDS = ("steps", "shs", "oscillation")
 
 @click.command("new", cls=SrfCommand, epilog=NEW)
 @click.argument("files", metavar="DATA...", nargs=-1, required=True, type=PATH)
-@click.option("--stiffness", metavar="K", help="Of the machine: '0.21 N/um', '55 MPa/mm', '5e-3 1/um' (friction per um).")
+@click.option(
+    "--stiffness", metavar="K", help="Stiffness of the machine: '0.21 N/um', '55 MPa/mm', or friction per um, '5e-3 1/um'."
+)
 @click.option(
     "--kind", type=click.Choice(KINDS), help="Velocity steps, slide-hold-slide, or a load that oscillates; else as found."
 )
@@ -48,14 +50,14 @@ KINDS = ("steps", "shs", "oscillation")
 )
 @click.option("--drive", metavar="V|D:V,...", help="What was imposed, if no column has it: um/s, or durations in s and um/s.")
 @click.option("--load", metavar="W", help="Constant normal load or stress, if no column has it: '5 N', '20 MPa'.")
-@click.option("--mass", metavar="M", help="Of the slider, '2.37 kg'; without it the slider is quasi-static.")
-@click.option("--radius", metavar="R", help="Of a rotary rig, '25 mm': torque over it is force, angle times it is displacement.")
-@click.option("--thickness", metavar="H", help="Of the layer, '4 mm', where strain is recorded.")
-@click.option("--area", metavar="A", help="Of the sliding contact, '25 cm^2': forces then become stresses.")
+@click.option("--mass", metavar="M", help="Mass of the slider, '2.37 kg'; without it the slider is quasi-static.")
+@click.option("--radius", metavar="R", help="Radius of a rotary rig, '25 mm', for torques and angles.")
+@click.option("--thickness", metavar="H", help="Thickness of the layer, '4 mm', where strain is recorded.")
+@click.option("--area", metavar="A", help="Area of the sliding contact, '25 cm^2': forces then become stresses.")
 @click.option("--window", metavar="FROM,TO", help="Only this part of the recordings, in s of the file's clock.")
 @click.option("--law", metavar="NAME", default="dieterich-ruina", help="Friction law.")
-@click.option("--ageing", metavar="NAME", help="Ageing law; else dieterich, with Linker's term where the load oscillates.")
-@click.option("--interface", metavar="NAME", default="rigid", help="Elasticity of the interface.")
+@click.option("--ageing", metavar="NAME", help="Evolution law; else dieterich, with Linker's term where the load oscillates.")
+@click.option("--interface", metavar="NAME", default="rigid", help="Shear stiffness of the interface, by name.")
 @click.option("--holdout", multiple=True, metavar="RUN", help="Keep this run from every fit, to judge it.")
 @click.option("--title", default="", show_default=False, metavar="TEXT", help="Title of the experiment.")
 @reader_option
@@ -65,8 +67,8 @@ KINDS = ("steps", "shs", "oscillation")
 def new(files: tuple[Path, ...], out: str | None, force: bool, plugins: tuple[Path, ...], **options: Any) -> None:
     """Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take.
 
-    Columns are recognised by heading and unit; time, what was imposed and what was observed are found in the data. What no table
-    says, the stiffness first of all, is asked for on a terminal and otherwise taken from the options.
+    Columns are recognised by heading and unit; time, what was imposed and what was observed are found in the data. What the
+    tables do not contain, the stiffness above all, is taken from the options, or asked for on a terminal.
     """
     from srfcli.data.columns import open_source
     from srfcli.data.draft import draft

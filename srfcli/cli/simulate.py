@@ -88,12 +88,7 @@ EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load
 @click.option("--field-length", metavar="UM", help="Correlation length of that field, in um.  [default: 10 um]")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of all that is random.")
 @click.option(
-    "--out-dir",
-    "--experiment",
-    "folder",
-    type=PATH,
-    metavar="DIR",
-    help="Write the records as an experiment folder, whole or not at all.",
+    "--out-dir", "folder", type=PATH, metavar="DIR", help="Write the records as an experiment folder, whole or not at all."
 )
 @click.option(
     "--start-values",

@@ -66,7 +66,9 @@ VELOCITY = Parameter("V", 10.0, "um/s", 1e-12, 1e9, "driving velocities")
     "--window", metavar="LOW:HIGH", help="Range of loads to search, in N.  [default: all loads at which a crossing can occur]"
 )
 @click.option("--tol", type=float, help="Relative error of a critical load.", default=1e-8)
-@click.option("--samples", type=click.IntRange(8, 100_000), default=192, help="Loads looked at first, on each line.")
+@click.option(
+    "--samples", type=click.IntRange(8, 100_000), default=192, help="Loads of a line at which growth is computed first."
+)
 @click.option("--resolution", default=1e-3, help="Finest spacing in ln W0 where a pair of crossings could hide.")
 @options.mesh_option(least=32)
 @options.output_options
@@ -228,9 +230,11 @@ srf continue --eps 0.09 --law log-log --ageing dieterich+linker-dieterich
 @click.option(
     "--scan-lines", "lines", type=click.IntRange(2, 10_000), default=10, help="Lines on which components are looked for."
 )
-@click.option("--samples", type=click.IntRange(8, 100_000), default=64, help="Points looked at first, on each line.")
+@click.option(
+    "--samples", type=click.IntRange(8, 100_000), default=64, help="Points of a line at which growth is computed first."
+)
 @options.step_option
-@click.option("--max-steps", type=click.IntRange(1, 1_000_000), default=3000, help="Longest curve, each way.")
+@click.option("--max-steps", type=click.IntRange(1, 1_000_000), default=3000, help="Most steps along a curve, in each direction.")
 @click.option("--tol", type=float, help="Relative error of each point; 1e-6 unless set.")
 @options.mesh_option(least=64)
 @options.output_options

@@ -48,9 +48,9 @@ class Default:
 
 DEFAULTS = {
     "law": Default("srf-vsat", "friction law"),
-    "ageing": Default("dieterich", "ageing law, with modifiers after a plus sign"),
-    "interface": Default("elastic", "tangential compliance of the interface"),
-    "loading": Default("vertical", "how the normal load is applied"),
+    "ageing": Default("dieterich", "evolution law of the state variable (ageing, slip, ...), with modifiers after a plus sign"),
+    "interface": Default("elastic", "shear stiffness of the interface, by name"),
+    "loading": Default("vertical", "vertical: the load is imposed; inclined: it follows a spring at --angle"),
     "inertia": Default(True, "whether the slider's mass counts"),
     "tol": Default(1e-6, "relative tolerance of numerical results"),
 }
