@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy as sp
+import tomli
 from recording_cases import write
 
 from srfcli.core.errors import SrfError
@@ -220,3 +221,10 @@ def test_a_breach_in_the_list_of_effects_is_told(experiment: Experiment, line: s
     with pytest.raises(SrfError, match="line 1") as caught:
         read_experiment(experiment.path, registry=REGISTRY)
     assert message in caught.value.message and caught.value.hint
+
+
+def test_bounds_of_a_search_are_no_bounds_of_a_law() -> None:
+    """Bounds that follow a recording may be widened in [parameters] of the augmented experiment."""
+    laws = merge(REGISTRY, ROCK, effects("second-state"))
+    stated = tomli.loads(law_files(laws, {})["friction.toml"])["parameters"]["D2"]
+    assert "upper" not in stated and 0 < stated["lower"] < 1e-3

@@ -32,7 +32,7 @@ from srfcli.laws.expression import parse_expression, symbol
 from srfcli.laws.law_file import FORMAT, known_symbols
 from srfcli.laws.registry import Registry, bundled_folder
 from srfcli.laws.values import AgeingLaw, Effect, FrictionLaw, Interface, Law, State
-from srfcli.symbolic.system import apart, without_part
+from srfcli.symbolic.system import apart, in_a_model, without_part
 
 # The augmented model as an experiment that every other command accepts: fitted laws, effects, the same recordings.
 
@@ -241,7 +241,7 @@ def _merged(laws: MergedLaws, effect: Effect, stays: Sequence[Effect]) -> Merged
         return None
     law = laws.law(slot)
     new = formula.xreplace({symbol(slot): before})
-    parameters = (*law.parameters, *(p for p in effect.parameters if p.name not in {q.name for q in law.parameters}))
+    parameters = (*law.parameters, *(p for p in in_a_model(effect) if p.name not in {q.name for q in law.parameters}))
     every = (*laws.friction.states, *states)
     known = known_symbols(KIND_OF_SLOT[slot], (p.name for p in parameters), every)
     if not {str(s) for s in new.free_symbols} <= set(known) or not _sayable(new, known):

@@ -172,7 +172,10 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
         reasons.append("held-out runs are not judged, as no run was fitted that would tell the gauge's noise")
     if own_noise:
         reasons.append(f"each {whole.by} was given a gauge noise of its own, as no one noise is that of all")
-    reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]
+    for fitted in (best, *(f for f in close if f is not best)):
+        for name in at_bounds(fitted):
+            there = "" if name in (q.name for q in whole.parameters) else " of the augmented experiment"
+            reasons.append(f"{name} of {fitted.name} stands at its bound; [parameters]{there} can widen it")
     if search.cut_short:
         reasons.append(f"the search ended at its budget of {search.budget:.0f} s of CPU, with models left to fit")
     named = {n for f in close for n in f.hypothesis.reported}  # found all the same
@@ -437,9 +440,10 @@ def _confidence(
 
 
 def parameters_of(fitted: Fitted) -> dict[str, dict[str, Any]]:
-    """Return the free parameters in their declared units with standard errors; a stiffness also as a ratio to the stated one."""
+    """Return the free parameters in declared units with standard errors, NaN at a bound; a stiffness over the stated one too."""
     problem, values, k = fitted.fit.likelihood.problem, fitted.fit.values, len(fitted.fit.likelihood.problem.names)
     errors = np.sqrt(np.maximum(np.diag(fitted.fit.covariance)[:k], 0.0))
+    errors[[problem.names.index(name) for name in at_bounds(fitted)]] = np.nan
     found: dict[str, dict[str, Any]] = {}
     for name, error in zip(problem.names, errors.tolist(), strict=True):
         unit = problem.unit_of(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -120,7 +121,7 @@ class DiagnosisResult(Result):
         if self.verdict == "identified":
             named = [f"the ageing law is {name}, not {stated}" if name in laws else name for name in named]
         bounds = at_bounds(self.diagnosis.final)
-        beside = f"; {', '.join(bounds)} at {'its bound' if len(bounds) == 1 else 'their bounds'}: widen" if bounds else ""
+        beside = f"; {', '.join(bounds)} at {'its bound' if len(bounds) == 1 else 'their bounds'}" if bounds else ""
         return SENTENCES[self.verdict].format(" and ".join(named)) + beside
 
     @property
@@ -194,8 +195,9 @@ class DiagnosisResult(Result):
         for name, found in added(fitted, self.diagnosis.baseline).items():
             if name != "ratio":
                 unit, factor = self.diagnosis.experiment.shown(str(found["unit"]))
-                shown = "" if unit == "1" else f" {unit}"
-                told.append(f"{name} = {found['value'] * factor:.5g} +- {found['stderr'] * factor:.2g}{shown}")
+                shown, error = "" if unit == "1" else f" {unit}", f" +- {found['stderr'] * factor:.2g}"
+                error = " at its bound" if math.isnan(found["stderr"]) else error
+                told.append(f"{name} = {found['value'] * factor:.5g}{error}{shown}")
         return told or ["no parameter more"]
 
     @property
