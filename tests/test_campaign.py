@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+import srfcli
 from srfcli.cli.main import cli
 from srfcli.tasks.campaign import fit_campaign
 
@@ -69,6 +70,19 @@ def test_a_row_for_each_experiment_and_a_reason_for_those_without_a_fit() -> Non
     assert one["segments"] == one["steady"] == 1 and not rows["one"]["flags"]
     assert float(rows["drifts"]["final_slope"]) == pytest.approx(0.04, rel=0.2)
     assert "friction still changes with slip at the end of 1 of 1 segments" in rows["drifts"]["flags"]
+
+
+def test_a_fitted_stiffness_has_covariances_in_the_unit_of_k() -> None:
+    experiment("one", seed=1)
+    text = Path("one/experiment.toml").read_text(encoding="utf-8")
+    Path("one/experiment.toml").write_text(text.replace("# K =", "K ="), encoding="utf-8")
+    srf("fit", "one", "--table", "out.csv", "--track", "smooth")
+    row = {key: float(value) for key, value in rows_of(Path("out.csv"))["one"].items() if _is(value)}
+    found = srfcli.fit("one", track="smooth").found.fit
+    place = [found.names.index(name) for name in ("D0", "K")]
+    shared = found.covariance[place[0], place[1]] / np.sqrt(np.prod(np.diag(found.covariance)[place]))
+    assert 0.3 < abs(shared) < 1
+    assert row["cov_D0_k"] / (row["D0_stderr"] * row["k_stderr"]) == pytest.approx(shared, rel=1e-9)
 
 
 def test_of_what_varies_a_row_has_the_mean_and_says_so() -> None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -680,7 +681,8 @@ class ThresholdFitResult(Result):
 # A campaign: many experiments, a row each, as the table that a laboratory publishes.
 
 ROOM = 60  # letters of the experiments' names that stand upright below the figure
-PAIRS = (("A", "B"), ("A", "D0"), ("B", "D0"))  # whose covariances a fit of a velocity step is quoted with
+QUOTED = ("A", "B", "D0", "K")  # whose covariances a fit of a velocity step is quoted with
+PAIRS = {f"cov_{a}_{b}".replace("K", "k"): (a, b) for a, b in combinations(QUOTED, 2)}
 LEADING = (
     Column("experiment", "", "folder or file"),
     Column("status", "", "of the fit; failed where there is none"),
@@ -740,7 +742,8 @@ class CampaignResult(Result):
             unit = next(iter(units)) if len(units) == 1 else ""
             columns += [Column(name, unit, "estimate"), Column(f"{name}_stderr", unit, "standard error", ".3g")]
         both = {"A", "B"} <= set(names)
-        covariances = [Column(f"cov_{a}_{b}", "", "covariance") for a, b in PAIRS if {a, b} <= set(names)]
+        fitted = {name for row in self.rows for name in row.get("parameters", {})}
+        covariances = [Column(name, "", "covariance") for name, pair in PAIRS.items() if {*pair} <= fitted]
         columns += [*(DERIVED if both else ()), *(c for c in STATED if c.name not in names), *covariances, *TRAILING]
         cells = []
         for row in self.rows:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -137,11 +138,12 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
         parameters[name] = (shown, _number(error), unit)
     place = {name: k for k, name in enumerate(result.names)}
     covariance = np.asarray(result.covariance)
+    unit, factor = experiment.shown("1/um" if experiment.per_load else "N/um")
 
     def shared(a: str, b: str) -> float | None:
         if not {a, b} <= place.keys():
             return None
-        scale = from_base(1.0, problem.unit_of(a)) * from_base(1.0, problem.unit_of(b))
+        scale = math.prod([factor if name == "K" else from_base(1.0, problem.unit_of(name)) for name in (a, b)])
         return _number(float(covariance[place[a], place[b]]) * scale)
 
     row: dict[str, Any] = {
@@ -149,14 +151,13 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
         "runs": len(runs), "samples": sum(int(run.used.sum()) for run in runs),
         "load": float(np.mean([run.load(run.t)[0].mean() for run in runs])), "load_unit": runs[0].load_unit,
         "parameters": parameters, "rms_over_noise": _number(result.rms_over_noise()),
-        "covariances": {f"cov_{a}_{b}": shared(a, b) for a, b in PAIRS},
+        "covariances": {name: shared(*pair) for name, pair in PAIRS.items()},
     }  # fmt: skip
     row["V0"] = next((q.value for q in experiment.parameters if q.name == "V0"), None)
     V = np.concatenate([np.abs(run.drive(run.t)) for run in runs])
     row |= {"V_min": float(V.min()), "V_max": float(V.max())}
     if found.difference is not None:
         row["A_minus_B"], row["A_minus_B_stderr"] = found.difference
-    unit, factor = experiment.shown("1/um" if experiment.per_load else "N/um")
     own_stiffness = runs[0].stiffness / (runs[0].first_load if experiment.per_load else 1.0)
     stated = float(values.get("K", own_stiffness))
     row |= {"k": stated * factor, "k_unit": unit, "k_stderr": parameters["K"][1] if "K" in parameters else None}
