@@ -254,6 +254,20 @@ def test_a_reset_is_taken_out(tmp_path: Path) -> None:
     assert np.flatnonzero(~run.used).tolist() == [899, 900]
 
 
+@pytest.mark.parametrize(("asked", "moved"), [("reset", False), ("small-reset", True)])
+def test_a_jump_that_may_be_something_else_is_taken_out_by_its_own_name(asked: str, moved: bool, tmp_path: Path) -> None:
+    """Less than a twentieth of the level, and far beyond the noise."""
+    c = Columns()
+    sound = c.u.copy()
+    c.u[900:] += 0.045 * np.median(c.u)
+    c.toml += f'corrections = ["{asked}"]\n'
+    run = c.read(tmp_path)
+    (told,) = [n.what for n in run.notices if n.kind == "reset"]
+    assert ("is moved back by that much" in told) is moved and ('["small-reset"]' in told) is not moved
+    assert (run.observed[run.used] == pytest.approx(sound[run.used], abs=0.08)) is moved
+    assert np.flatnonzero(~run.used).tolist() == ([899, 900] if moved else [])
+
+
 def test_a_correction_is_proposed_and_drawn_and_made_only_where_it_is_asked_for(tmp_path: Path) -> None:
     c = Columns()
     sound = c.u.copy()

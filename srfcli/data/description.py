@@ -45,7 +45,7 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
 }
 READABLE = (*OBSERVABLES, "shear_stress", *OTHER_OBSERVABLES)  # what `observables` may list
 MOST_OBSERVABLES = 3  # of a run
-CORRECTIONS = ("reset", "spike")  # of a run: what is proposed, and made only where it is asked for
+CORRECTIONS = ("reset", "small-reset", "spike")  # of a run: what is proposed, and made only where it is asked for
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
 _RUN = (
     "name", "file", "format", "holdout", "window", "drive", "start", "load", "modulation", "initial", "direction",

@@ -397,8 +397,9 @@ def clean_observable(
     """Return the observable (n,), which samples are to be compared, its quantisation step, what was found, and what is proposed.
 
     `rise` (n,) is the fastest rise per second that the drive allows. Empty cells and saturated samples are not to be compared.
-    With "spike" among the `corrections` spikes are not either; with "reset" level jumps of the transducer are taken out, and the
-    samples beside them are not compared. What is proposed is the observable (n,) with all of this done, None where nothing is.
+    With "spike" among the `corrections` spikes are not either; with "reset" level jumps that only a transducer can make are taken
+    out, with "small-reset" those that may be something else, and the samples beside them are not compared. What is proposed is
+    the observable (n,) with spikes and certain jumps taken out, None where nothing is.
     Raises SrfError where nothing is left.
     """
     t = place.t
@@ -419,25 +420,26 @@ def clean_observable(
     notices += place.spots("spike", spiky, f"standing out in '{place.heading}', {left}")
     calm = np.interp(t, t[~spiky], filled[~spiky])
     jumps = observable_jumps(calm, t, rise, np.abs(np.diff(W, prepend=W[0])) / W < STEADY_LOAD, quantum)
-    level, beside = calm.copy(), np.zeros(x.size, bool)  # certain jumps taken out; the samples on each side of one
+    level, done, beside = calm.copy(), calm.copy(), np.zeros(x.size, bool)  # as proposed, as asked for; beside what is asked for
     for jump in jumps:
-        level[jump.at + 1 :] -= jump.size if jump.certain else 0.0
-        beside[jump.at : jump.at + 2] = "reset" in corrections
+        asked = ("reset" if jump.certain else "small-reset") in corrections
+        level[jump.at + 1 :] -= jump.size if jump.certain or asked else 0.0
+        done[jump.at + 1 :] -= jump.size if asked else 0.0
+        beside[jump.at : jump.at + 2] |= asked
     proposed = level if spiky.any() or (level != calm).any() else None
-    observed = np.where(spiky, filled + level - calm, level) if "reset" in corrections else filled
+    observed = np.where(spiky, filled + done - calm, done) if (done != calm).any() else filled
     spiky = spiky & ("spike" in corrections)
     white = white_level(calm)
     if quantum > COARSE_STEP * white > 0:
         what = f"steps of {quantum:.4g}, {quantum / white:.2g} times the white noise, which they add to"
         notices.append(Notice("quantisation", place.column, what))
     for jump in jumps:
-        if not jump.certain:
-            done = "faster than the drive moves, but too little to be sure of a transducer set anew; left as it is"
-        elif "reset" in corrections:
-            done = "a transducer set anew; what follows is moved back by that much, and the two samples are not compared"
-        else:
-            done = 'faster than the drive moves; left as it is; corrections = ["reset"] moves what follows back by that much'
-        what = f"'{place.heading}' jumps by {jump.size:.4g}: {done}"
+        name = "reset" if jump.certain else "small-reset"
+        why = "faster than the drive moves" + ("" if jump.certain else ", but too little to be sure of a transducer set anew")
+        told = f'left as it is; corrections = ["{name}"] moves what follows back by that much'
+        if name in corrections:
+            told = "what follows is moved back by that much, and the two samples are not compared"
+        what = f"'{place.heading}' jumps by {jump.size:.4g}: {why}; {told}"
         notices.append(Notice("reset", place.span(jump.at, jump.at + 1), what))
     used = known & ~clipped & ~spiky & ~beside
     if used.sum() < 8:
