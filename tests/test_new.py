@@ -526,3 +526,14 @@ def test_what_is_written_of_stresses_is_read_again(stiffness: tuple[str, ...], s
     for folder in written:
         srf("check", "--no-simulate", folder)
         assert srfcli.read_experiment(folder).stiffness == pytest.approx(stated, rel=1e-12)
+
+
+def test_times_rounded_in_minutes_leave_the_drive_even(step: dict[str, np.ndarray]) -> None:
+    """Seven digits of minutes and of millimetres: the rounding grows, and no curve follows it better than a line."""
+    rows = zip(step["t"] / 60, step["x"] / 1000, SIGMA * step["mu"], step["sigma"], strict=True)
+    heading = "Elapsed Time (min),Displacement (mm),Shear stress (MPa),Normal stress (MPa)"
+    Path("run1.csv").write_text("\n".join([heading, *(",".join(f"{x:.7g}" for x in row) for row in rows)]) + "\n")
+    srf("new", "run1.csv", "--stiffness", "40 MPa/mm")
+    said = srf("check", "--no-simulate", ".").stdout
+    assert "2 straight pieces, 1, 10 um/s" in said and "drive-smoothed" not in said and "reset:" not in said
+    assert "upper = 500" in next(x for x in Path("experiment.toml").read_text().splitlines() if x.startswith("D0 ="))

@@ -198,12 +198,15 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
     for at, size in line.jumps if correct else ():
         moved[at + 1 :] -= size
     if line.misfit > OFF_THE_LINE * line.noise or (line.misfit > 2 * line.noise and _bends(t[known], moved, line)):
-        drive, kind = _smooth_drive(t[known], moved), "drive-smoothed"
-        what = (
-            f"a smooth curve, {drive(t).min():.5g} to {drive(t).max():.5g} um/s, goes through the displacements, from which "
-            f"they differ by {np.std(moved - drive.displacement(t[known])):.3g} um (rms), {line.misfit:.3g} from {slopes.size} "
-            f"{pieces}; if the stage went evenly, look at the column, or state the run's drive"
-        )
+        curve = _smooth_drive(t[known], moved)
+        left = float(np.std(moved - curve.displacement(t[known])))
+        if left < line.misfit / NEARER:  # else what the line leaves is noise: of rounded times, say, or of rounding that grows
+            drive, kind = curve, "drive-smoothed"
+            what = (
+                f"a smooth curve, {drive(t).min():.5g} to {drive(t).max():.5g} um/s, goes through the displacements, from which "
+                f"they differ by {left:.3g} um (rms), {line.misfit:.3g} from {slopes.size} {pieces}; if the stage went evenly, "
+                "look at the column, or state the run's drive"
+            )
     back = int(np.argmin(way))
     if -way[back] > line.misfit:
         told = f"{-way[back]:.3g} um at t = {line.knots[back]:.7g} s"
@@ -336,6 +339,7 @@ SAMPLES_BESIDE = 200  # samples on each side by which a jump is told from a corn
 EVEN = 1e-5  # of the largest noise, at least: with smaller ones the rest would be lost in rounding
 LEAST_NOISE = 1e-100  # um or um/s: a noise whose square is still a number
 OFF_THE_LINE = 30.0  # times its noise that a displacement differs from the line, from where a smooth curve takes its place
+NEARER = 5.0  # times less that a smooth curve leaves than the line, from where it takes its place
 MOST_RAMPS = 64  # of velocity, to one piece of that curve
 SMOOTHEST = 1e-6  # of the displacement's range, by which they may differ from the curve
 WOBBLE = 0.02  # relative change of slope below which there is no corner
@@ -476,7 +480,7 @@ def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
     penalty, jumps = 3 * np.log(t.size), []
     for _ in range(4):
         breaks = split(t, x, sigma, penalty)
-        found = _jumps(t, x, sigma, breaks, penalty)
+        found = [jump for jump in _jumps(t, x, sigma, breaks, penalty) if abs(jump[1]) > 4 * step]
         jumps += found
         if not found or not correct:
             break
