@@ -197,10 +197,11 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
     moved = X[known]
     for at, size in line.jumps if correct else ():
         moved[at + 1 :] -= size
-    if line.misfit > OFF_THE_LINE * line.noise or (line.misfit > 2 * line.noise and _bends(t[known], moved, line)):
+    bends = line.misfit > 2 * line.noise and _bends(t[known], moved, line)
+    if bends or line.misfit > OFF_THE_LINE * line.noise:
         curve = _smooth_drive(t[known], moved)
         left = float(np.std(moved - curve.displacement(t[known])))
-        if left < line.misfit / NEARER:  # else what the line leaves is noise: of rounded times, say, or of rounding that grows
+        if left < line.misfit / (2 if bends else NEARER):  # else what the line leaves is noise: of rounded times, say, or of rounding that grows
             drive, kind = curve, "drive-smoothed"
             what = (
                 f"a smooth curve, {drive(t).min():.5g} to {drive(t).max():.5g} um/s, goes through the displacements, from which "
