@@ -196,8 +196,9 @@ def test_what_a_rig_has_to_say(headings: list[str], options: tuple[str, ...], sa
 def test_a_stiffness_per_load_is_never_rescaled_in_silence(step: dict[str, np.ndarray]) -> None:
     for name, load in (("one.csv", SIGMA), ("two.csv", 2 * SIGMA)):
         table(["time_s", "v", "tau_MPa", "sigma_n_MPa"], [step["t"], step["V"], load * step["mu"], load + 0 * step["t"]], name)
-    srf("new", "one.csv", "two.csv", "--stiffness", "2e-3 1/um")
+    drafted = srf("new", "one.csv", "two.csv", "--stiffness", "2e-3 1/um").stderr
     said = srf("check", ".", "--no-simulate").stdout
+    assert "0.04 MPa/um under 20 MPa in one" in drafted
     assert "0.04 MPa/um under 20 MPa in one, 0.08 MPa/um under 40 MPa in two; a machine's own stiffness does not grow" in said
     text = Path("experiment.toml").read_text().replace("# K =", "K =")
     Path("experiment.toml").write_text(text.replace('upper = "0.004 1/um"', 'upper = "0.08 MPa/um"'))
@@ -221,13 +222,13 @@ def to_and_fro(*, strokes: int, K: float = 4e-4, W: float = 0.02, D0: float = 4.
     return np.array(out).T
 
 
-@pytest.mark.parametrize("drive", ["Position [um]", "Distance [um]", "Speed [um/s]"])
+@pytest.mark.parametrize("drive", ["Position [um]", "Distance [um]", "Speed [um/s]", ""])
 def test_a_reciprocating_tribometer_becomes_a_run_for_each_stroke(drive: str) -> None:
-    """The way gone and the speed are recorded without the direction, which the force then tells."""
+    """The way gone and the speed are recorded without the direction, or the speed is stated: the force then tells it."""
     t, x, F = to_and_fro(strokes=2)
-    moved = {"Position [um]": x, "Distance [um]": 5.0 * t, "Speed [um/s]": 5.0 + 0 * t}[drive]
-    table(["time [s]", drive, "Friction [uN]", "Normal [mN]"], [t, moved, 1e6 * F, 20 + 0 * t])
-    done = srf("new", "run1.csv", "--stiffness", "400 uN/um")
+    moved = {"Position [um]": [x], "Distance [um]": [5.0 * t], "Speed [um/s]": [5.0 + 0 * t], "": []}[drive]
+    table(["time [s]", *filter(None, [drive]), "Friction [uN]", "Normal [mN]"], [t, *moved, 1e6 * F, 20 + 0 * t])
+    done = srf("new", "run1.csv", "--stiffness", "400 uN/um", *(() if drive else ("--drive", "5")))
     assert "run1 slides to and fro: 2 strokes, a run each" in done.stderr
     runs = tomli.loads(Path("experiment.toml").read_text())["runs"]
     assert [(r["name"], r.get("direction"), r["holdout"]) for r in runs] == [
@@ -241,6 +242,10 @@ def test_a_reciprocating_tribometer_becomes_a_run_for_each_stroke(drive: str) ->
         )
     # as one run it is refused, with a window and a direction that would do
     whole = Path("experiment.toml").read_text().split("[[runs]]")[0] + '[[runs]]\nname = "all"\nfile = "run1.csv"\n'
+    if not drive:
+        Path("experiment.toml").write_text(whole + "drive = [{ duration = 80.0, velocity = 5.0 }]\n")
+        assert "the observable has both signs" in srf("check", ".", "--no-simulate").stdout
+        return
     Path("experiment.toml").write_text(whole)
     said = srf("check", ".", code=2).stderr
     assert "the drive turns back before t = 47" in said and 'direction = "backward"' in said

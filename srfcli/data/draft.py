@@ -32,7 +32,7 @@ from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.groups import levels
 from srfcli.data.imposed import LOADS, StartsAtRest, Stroke, find_modulation, strokes
 from srfcli.data.scales import scales_of
-from srfcli.data.values import BOUND_FACTOR, Run, told_of_runs
+from srfcli.data.values import BOUND_FACTOR, Experiment, Run, told_of_runs
 from srfcli.laws.registry import Registry
 
 NAMED = {  # role -> what headings call it, in small letters without their unit; the first that a file has is taken
@@ -361,8 +361,9 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
             raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, sketch.names))
     if set(wish.holdout) >= set(sketch.names):
         raise SrfError("--holdout: every run is held out", "Leave one to be fitted.")
-    sketch, runs = _read(sketch, registry)
-    remarks += told_of_runs(runs, MISREAD)
+    sketch, read = _read(sketch, registry)
+    runs = list(read.runs)
+    remarks += [*told_of_runs(runs, MISREAD), *filter(None, [read.rescaled()])]
     modulations = _modulations(runs)
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
     remarks.append(f"kind of experiment: {kind}, {why}")
@@ -401,7 +402,8 @@ def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
             source = open_source(run.file, registry=registry, format=run.format)
             columns = read_columns(run, source, described.columns, geometry=described.apparatus.geometry)
             rising = np.isfinite(columns.seconds) & (np.diff(columns.seconds, prepend=-np.inf) > 0)
-            found = strokes(columns.kept(rising)) if sketch.wish.drive is None else []
+            speed = sketch.wish.drive or 0.0  # of steps that are stated the sign is, too
+            found = strokes(columns.kept(rising), abs(speed)) if isinstance(speed, float) else []
             shown = found[:STROKES]
             files += [run.file] * max(len(shown), 1)
             names += [f"{run.name}-{k + 1}" for k in range(len(shown))] or [run.name]
@@ -546,12 +548,12 @@ class _Sketch:
         return lines
 
 
-def _read(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[Run]]:
-    """Return the runs as an experiment reads them, and the sketch with those that have to begin from a free state."""
+def _read(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, Experiment]:
+    """Return the sketch with the runs that have to begin from a free state, and the experiment as it is read."""
     while True:
         with _as_file(sketch.text((), absolute=True)) as file:
             try:
-                return sketch, list(read_experiment(file, registry=registry).runs)
+                return sketch, read_experiment(file, registry=registry)
             except StartsAtRest as error:
                 sketch = replace(sketch, free=(*sketch.free, error.run))
             except SrfError as error:

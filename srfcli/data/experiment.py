@@ -314,6 +314,10 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
     where, friction = columns.place(role).column, float(np.median(read.friction[used]))
     if not np.ptp(observed[used]):
         read = replace(read, notices=(*read.notices, Notice("constant", where, f"all readings are {observed[used][0]:g}")))
+    mu, usual = read.friction[used], 0.5 * float(np.median(np.abs(read.friction[used])))
+    if min(np.mean(mu > usual), np.mean(mu < -usual)) > BOTH_WAYS:
+        what = "the observable has both signs, and a run slides in one direction: `srf new` writes a run for each stroke"
+        return replace(read, notices=(*read.notices, Notice("friction", where, what)))
     if LEAST_FRICTION < friction < LARGEST_FRICTION:
         return read
     asked = "are the units of what is observed, of load and stiffness right?"
@@ -451,6 +455,7 @@ def clean_observable(
 
 LOAD_STEP, LOAD_STEP_SHARE = 0.01, 0.8  # of the load; of what it changes by with the intervals beside
 LATE = 10.0  # times the noise of what is observed, from where it is told that a step of the drive may have been between samples
+BOTH_WAYS = 0.1  # share of readings of either sign, from where a run slides to and fro
 LEAST_FRICTION, LARGEST_FRICTION = 0.01, 3.0  # that surfaces which slide in contact have
 NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "gap": "samples are missing",

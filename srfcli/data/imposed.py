@@ -201,7 +201,7 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
     if bends or line.misfit > OFF_THE_LINE * line.noise:
         curve = _smooth_drive(t[known], moved)
         left = float(np.std(moved - curve.displacement(t[known])))
-        if left < line.misfit / (2 if bends else NEARER):  # else what the line leaves is noise: of rounded times, say, or of rounding that grows
+        if left < line.misfit / (2 if bends else NEARER):  # else the line leaves noise, of rounded times, say
             drive, kind = curve, "drive-smoothed"
             what = (
                 f"a smooth curve, {drive(t).min():.5g} to {drive(t).max():.5g} um/s, goes through the displacements, from which "
@@ -264,18 +264,19 @@ class Stroke:
     backward: bool
 
 
-def strokes(columns: Columns) -> list[Stroke]:
+def strokes(columns: Columns, speed: float = 0.0) -> list[Stroke]:
     """Return the strokes of a recording whose drive turns back and slides there; none where it only goes on or unloads.
 
-    The recording has a column of the load point's displacement or velocity. After a turn the slider sticks while the spring is
-    unloaded, so that what comes before the change of sign of the observable is left out.
+    Without a column of the load point's displacement or velocity it moves at `speed` um/s, and the sign of the observable tells
+    where it turns. After a turn the slider sticks while the spring is unloaded, so that what comes before the change of sign of
+    the observable is left out.
     """
     t, arrays = columns.seconds, columns.arrays
     observed = arrays[next(role for role in OBSERVABLES if role in arrays)]
     if "load_point_displacement" in arrays:
         moved = arrays["load_point_displacement"]
     else:
-        V = arrays["load_point_velocity"]
+        V = arrays.get("load_point_velocity", np.full(t.size, speed))
         moved = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(V[:-1]), V[:-1], 0.0) * np.diff(t))])
     known = np.isfinite(moved) & np.isfinite(observed)
     t, x, y = t[known], moved[known], observed[known]

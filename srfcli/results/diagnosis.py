@@ -149,8 +149,9 @@ class DiagnosisResult(Result):
             (r["name"], r["evidence"] - zero, r["rms_over_noise"], r["field"], r["confidence"], r["against"])
             for r in ranked[:HYPOTHESES_SHOWN]
         ]
-        notes = tuple(_notes(self.answer, recorded=bool(self.diagnosis.experiment.runs)))
-        return Table("srf.diagnose.hypotheses/1", HYPOTHESES, rows, "hypotheses", notes, status=self.status.value)
+        notes = _notes(self.answer, recorded=bool(self.diagnosis.experiment.runs))
+        notes += filter(None, [self.diagnosis.experiment.rescaled()])
+        return Table("srf.diagnose.hypotheses/1", HYPOTHESES, rows, "hypotheses", tuple(notes), status=self.status.value)
 
     def __str__(self) -> str:
         return f"{self.sentence}\n\n{super().__str__()}"
