@@ -20,8 +20,9 @@ from scipy.linalg import cho_factor, cho_solve
 from srfcli.cli.main import cli
 from srfcli.codegen.model import open_model
 from srfcli.data.experiment import check_run, read_experiment
+from srfcli.data.gauge import GaugeNoise, with_slower
 from srfcli.data.values import Experiment, FitParameter
-from srfcli.inference import cramer_rao as reach
+from srfcli.inference import cramer_rao
 from srfcli.inference.cramer_rao import CramerRaoBound, Forecast, forecast
 from srfcli.inference.fit import fit_problem
 from srfcli.inference.prediction import predict
@@ -254,7 +255,7 @@ def test_bounds_and_free_starts_cost_what_they_must(made: Path) -> None:
 def test_a_long_run_is_thinned_without_another_answer(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     experiment = read_experiment(made, registry=REGISTRY)
     whole = told(experiment).runs[1].errors
-    monkeypatch.setattr(reach, "MOST_SIMULATED", 900)
+    monkeypatch.setattr(cramer_rao, "MOST_SIMULATED", 900)
     thin = told(experiment).runs[1].errors
     for name in whole:  # what a step of the load makes takes a few samples, of which blocks have more or fewer
         assert thin[name] == pytest.approx(whole[name], rel=0.3)
@@ -321,3 +322,13 @@ def make_file(tmp_path: Path) -> Callable[[str], Path]:
         return tmp_path / name
 
     return make
+
+
+def test_a_fast_stretch_has_the_slow_noise_that_another_rate_shows() -> None:
+    """A quarter of a second at 1 kHz tells a line at 4.6 Hz from no trend, and the gauge has it all the same."""
+    fast = GaugeNoise(1e-3, colours=((60.0, 2e-3, 3.0),), samples=9000, stretch=0.25)
+    slow = GaugeNoise(1e-3, colours=((4.6, 0.04, 3.0), (20.0, 3e-3, 2.0), (0.5, 0.01), (0.1, 0.02)), samples=900, stretch=2.5)
+    few = GaugeNoise(1e-3, colours=((1.0, 9.0),), samples=90, stretch=6.4)
+    assert [n.colours for n in with_slower((fast, slow))] == [(*fast.colours, slow.colours[0], slow.colours[2]), slow.colours]
+    assert with_slower((fast, slow, few))[1].colours == slow.colours
+    assert with_slower((slow,)) == (slow,)

@@ -23,7 +23,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import to_base
 from srfcli.data.clock import Mask
 from srfcli.data.experiment import RunCheck
-from srfcli.data.gauge import whiten
+from srfcli.data.gauge import whiten, with_slower
 from srfcli.data.values import Experiment, ModelChoice
 from srfcli.inference.fit import solve_scaled
 from srfcli.inference.prediction import own_names, own_start, predict, run_parameters, stiffness_share
@@ -229,7 +229,7 @@ def innovations(check: RunCheck, chosen: NDArray[np.int64], J: Array, used: Mask
         place = np.arange(chosen.size) % NOISE_BLOCK
         begins, counts = begins | (place == 0), used & (place >= NOISE_BLOCK // 2)
     begins = np.diff(np.cumsum(begins)[used], prepend=-1) > 0  # a beginning that is not used passes to the next sample that is
-    white = whiten(check.noises, at[used], begins, t[used], J[used])
+    white = whiten(with_slower(check.noises), at[used], begins, t[used], J[used])
     return np.asarray(math.sqrt(weight) * white[counts[used]])
 
 
