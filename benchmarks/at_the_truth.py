@@ -87,8 +87,8 @@ def right_problem(folder: Path, concealed: dict[str, Any]) -> tuple[ModelSearch,
     registry = bundled_registry()
     search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
     hypothesis, experiment = right_hypothesis(search, concealed), search.experiment
-    if concealed["noise"] == "one run louder":
-        experiment = replace(experiment, vary=(GAUGE_NOISE,), by="run")
+    if concealed["noise"] == "one run louder" and len(experiment.runs) > 1:
+        experiment = replace(experiment, vary={GAUGE_NOISE: "run"})
     return search, hypothesis, hypothesis.problem(registry, experiment)
 
 

@@ -150,10 +150,10 @@ def test_the_recordings_are_the_same(experiment: Experiment, tmp_path: Path) -> 
 
 
 def test_what_varies_goes_along(experiment: Experiment, tmp_path: Path) -> None:
-    varied = replace(experiment, vary=("A",), by="load", trend="time")
+    varied = replace(experiment, vary={"A": "load", "noise": "run"}, by="load", trend="time")
     fit = fitted(varied, A=(0.0133, 0.006, 0.03, "1"))
     again, _ = written(varied, (), fit, tmp_path / "new")
-    assert (again.vary, again.by, again.trend) == (("A",), "load", "time")
+    assert (again.vary, again.by, again.trend) == ({"A": "load", "noise": "run"}, "load", "time")
 
 
 def test_stiffness_and_mass_go_into_the_apparatus(experiment: Experiment, tmp_path: Path) -> None:

@@ -135,6 +135,17 @@ def test_what_varies_between_runs_is_told(offset):
     assert 0.8 < held["rms_over_noise"] < 1.2
 
 
+def test_each_parameter_may_vary_with_something_of_its_own(offset):
+    """mu0 by run, D0 by load: the held-out run has a mu0 of its own, and the D0 of its load."""
+    result = srf.fit(srf.read_experiment(offset), free=["mu0", "A", "D0"], vary="mu0,D0:load", track="smooth")
+    names = {row["parameter"] for row in result.table.records()}
+    assert names == {*(f"mu0[up{k}]" for k in range(3)), "A", "D0[3 N]", "D0[4 N]"}
+    held = next(row for row in result.table.meta["runs"] if row["role"] == "held out")
+    assert 0.8 < held["rms_over_noise"] < 1.2
+    with pytest.raises(srf.SrfError, match="'lode' is not one of its values"):
+        srf.fit(srf.read_experiment(offset), free=["mu0", "D0"], vary="D0:lode")
+
+
 def test_what_varies_with_the_load_is_one_value_a_load(offset):
     found = vary(offset, "--vary", "mu0,D0", "--by", "load", "--track", "smooth")[1]
     assert {f"{name}[{load} N]" for name in ("mu0", "D0") for load in (3, 4)} < {row["parameter"] for row in found["rows"]}
@@ -177,7 +188,7 @@ def test_a_run_is_cut_between_its_steps(ladder, tmp_path):
     assert np.diff([run.start for run in pieces])[:3] == pytest.approx(driven, abs=2)
     own = with_model(ladder, tmp_path / "own", 'by = "segment"', 'vary = ["mu0"]', run="segments = [8.0, 23.0]\n")
     read = srf.read_experiment(own)
-    assert read.vary == ("mu0",) and [run.t[0] for run in read.runs] == pytest.approx([0, 8, 23])
+    assert read.vary == {"mu0": "segment"} and [run.t[0] for run in read.runs] == pytest.approx([0, 8, 23])
     done = CliRunner().invoke(cli, ["check", str(own), "--no-simulate", "--csv"])
     assert [line.split(",")[0] for line in done.stdout.splitlines()[1:]] == [f"simulated-{k}" for k in (1, 2, 3)]
     done = CliRunner().invoke(cli, ["fit", str(own), "--track", "smooth", "--csv"])
@@ -205,7 +216,7 @@ def test_steps_up_and_down_and_strokes_are_groups(ladder, tmp_path):
     halves[1] = halves[1].replace("simulated.csv", "back.csv")
     (tmp_path / "strokes" / "experiment.toml").write_text("[[runs]]".join((head, *halves)), encoding="utf-8")
     both = grouped(srf.read_experiment(tmp_path / "strokes"), ["mu0"], "direction")
-    assert labels(both) == {"out": "forward", "back": "backward"}
+    assert labels(both, "direction") == {"out": "forward", "back": "backward"}
 
 
 @pytest.mark.parametrize(
@@ -215,6 +226,7 @@ def test_steps_up_and_down_and_strokes_are_groups(ladder, tmp_path):
         ('trend = "slop"', "slip"),
         ('vary = "mu0"', 'vary = ["mu0"]'),
         ('vary = ["E"]', "model.vary[0]: 'E' is to vary, and is not in [parameters]"),
+        ('vary = ["mu0:lode"]', "model.vary[0]: 'lode' is nothing that mu0 may vary with"),
     ],
 )
 def test_what_varies_is_checked_where_it_is_written(line, what, ladder, tmp_path):

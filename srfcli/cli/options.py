@@ -596,7 +596,7 @@ def vary_options(function: F) -> F:
     """Add --trend, --vary and --by, which fits of recordings have in common."""
     ways = ["run", "load", "segment", "direction"]
     by = click.option("--by", type=click.Choice(ways), help="Groups of --vary; unless given, those of the experiment, else runs.")
-    text = "Parameters, or noise, with a value of their own in each group that --by names, else in each run."
+    text = "Parameters, or noise, with a value of their own in each group of --by, else in each run; or NAME:BY, as B:load."
     vary = click.option("--vary", multiple=True, metavar="NAMES", help=text)
     text = "Let each run's observable drift with slip or time, or not; unless given, as the experiment says."
     trend = click.option("--trend", type=click.Choice(["slip", "time", "none"]), help=text)

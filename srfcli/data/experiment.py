@@ -73,8 +73,11 @@ def read_experiment(
     )  # fmt: skip
     vary = model.read("vary", lambda listed: listed.items("parameters", 'Write vary = ["mu0"].'), [])
     for entry in vary:
-        if entry.text() not in (free := [*(q.name for q in parameters), GAUGE_NOISE]):
-            entry.fail(f"'{entry.text()}' is to vary, and is not in [parameters]", did_you_mean(entry.text(), free))
+        name, _, way = entry.text().partition(":")
+        if name not in (free := [*(q.name for q in parameters), GAUGE_NOISE]):
+            entry.fail(f"'{name}' is to vary, and is not in [parameters]", did_you_mean(name, free))
+        if way and way not in BY:
+            entry.fail(f"'{way}' is nothing that {name} may vary with", did_you_mean(way, BY))
     found = grouped(found, [entry.text() for entry in vary], model.read("by", lambda by: by.choice(BY), "run"))
     names = dict.fromkeys([*(run.name for run in described.runs), *(run.name for run in found.runs)])
     for q in found.parameters:

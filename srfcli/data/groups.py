@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from srfcli.core.errors import SrfError
+from srfcli.core.errors import SrfError, check_choice
 from srfcli.data.values import Experiment, Run
 
 BY = ("run", "load", "segment", "direction")
@@ -24,13 +24,19 @@ FEWEST_OF_RUN = 8  # samples of a run
 def grouped(experiment: Experiment, vary: Sequence[str] = (), by: str | None = None, trend: str | None = None) -> Experiment:
     """Return the experiment with what varies, by what, and along what its observables drift; left out, as it says itself.
 
-    A trend of "none" takes that of the experiment back. By segment or direction, its runs are cut between the steps of their
-    velocities; a stroke of a reciprocating drive is not.
+    What varies is NAME or NAME:BY, where `by` is not what that one varies with. A trend of "none" takes that of the experiment
+    back. By segment or direction, its runs are cut between the steps of their velocities; a stroke of a reciprocating drive is
+    not.
     """
-    drift = None if trend == "none" else trend or experiment.trend
-    chosen = replace(experiment, vary=tuple(vary) or experiment.vary, by=by or experiment.by, trend=drift)
-    strokes = chosen.by == "direction" and any(run.backward for run in experiment.runs)
-    if chosen.by not in CUT or experiment.by in CUT or strokes:  # what is cut already stays as it is
+    drift, usual = None if trend == "none" else trend or experiment.trend, by or experiment.by
+    own = {name: by or way for name, way in experiment.vary.items()}
+    own = {name: way or usual for name, _, way in (entry.partition(":") for entry in vary)} or own
+    for way in own.values():
+        check_choice("by", way, BY)
+    chosen = replace(experiment, vary=own, by=usual, trend=drift)
+    strokes = any(run.backward for run in experiment.runs)
+    cut, before = ({way for way in (*e.vary.values(), e.by) if way in CUT} for e in (chosen, experiment))
+    if not cut or before or (strokes and cut == {"direction"}):  # what is cut already stays as it is
         return chosen
     runs = tuple(piece for run in experiment.runs for piece in segments(run))
     name, count = Counter(run.name for run in runs).most_common(1)[0]
@@ -39,13 +45,13 @@ def grouped(experiment: Experiment, vary: Sequence[str] = (), by: str | None = N
     return replace(chosen, runs=runs)
 
 
-def labels(experiment: Experiment) -> dict[str, str]:
+def labels(experiment: Experiment, by: str) -> dict[str, str]:
     """Return the group of each run, by its name."""
-    if experiment.by == "load":
+    if by == "load":
         return {run.name: f"{run.first_load:.3g} {run.load_unit}" for run in experiment.runs}
-    if experiment.by == "direction" and any(run.backward for run in experiment.runs):  # strokes of a reciprocating drive
+    if by == "direction" and any(run.backward for run in experiment.runs):  # strokes of a reciprocating drive
         return {run.name: "backward" if run.backward else "forward" for run in experiment.runs}
-    if experiment.by == "direction":
+    if by == "direction":
         return {run.name: step(run) for run in experiment.runs}
     return {run.name: run.name for run in experiment.runs}
 

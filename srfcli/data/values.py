@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -189,8 +189,8 @@ class CriticalLoads:
 class Experiment:
     """Runs and critical loads under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider.
 
-    Parameters in `vary` have a value for each run, load, segment or direction, as `by` says. Observables drift with slip or
-    time where there is a `trend`.
+    Parameters in `vary` have a value for each run, load, segment or direction, as that says of each; `by` is what they vary with
+    unless it is said. Observables drift with slip or time where there is a `trend`.
     """
 
     path: Path
@@ -202,7 +202,7 @@ class Experiment:
     runs: tuple[Run, ...]
     notices: tuple[Notice, ...]
     stiffness_unit: str = ""
-    vary: tuple[str, ...] = ()
+    vary: Mapping[str, str] = field(default_factory=dict)
     by: str = "run"
     trend: str | None = None
     thresholds: tuple[CriticalLoads, ...] = ()

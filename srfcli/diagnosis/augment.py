@@ -97,7 +97,8 @@ def augment(
     rig |= {"stiffness": as_recorded(text, experiment)} | ({"mass": f"{shortest(mass, KILOGRAM)!r} kg"} if mass else {})
     model: dict[str, object] = {"law" if kind == "friction" else kind: f"{kind}.toml" for kind in LAW_KINDS}
     model |= {"inertia": inertia} | ({"effects": effects} if effects else {})
-    model |= {"vary": experiment.vary, "by": experiment.by} if experiment.vary else {}
+    vary = [name if by == experiment.by else f"{name}:{by}" for name, by in experiment.vary.items()]
+    model |= {"vary": vary, "by": experiment.by} if vary else {}
     model |= {"trend": experiment.trend} if experiment.trend else {}
     lines = toml_lines({"format": "srf-experiment/1", "title": title.strip()})
     tables = [("[apparatus]", rig), ("[model]", model)]

@@ -635,7 +635,7 @@ class ModelSearch:
         if GAUGE_NOISE in self.experiment.vary or not uneven_noise(base.fit):
             return base
         experiment, whole = (
-            replace(e, vary=(*e.vary, GAUGE_NOISE), by=e.by if e.vary else "run") for e in (self.experiment, self.whole)
+            replace(e, vary={**e.vary, GAUGE_NOISE: e.by if e.vary else "run"}) for e in (self.experiment, self.whole)
         )
         problem = base.hypothesis.problem(self.registry, experiment, at=base.fit.values, trend=self.trend)
         start = _followable(base.fit.values, problem)

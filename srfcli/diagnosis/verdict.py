@@ -145,7 +145,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     ranked = tuple(search.ranked())
     own_noise = GAUGE_NOISE in set(search.whole.vary) - set(whole.vary)
     if own_noise:
-        whole = replace(whole, vary=search.whole.vary, by=search.whole.by)
+        whole = replace(whole, vary=search.whole.vary)
     baseline, best = search.baseline, ranked[0]
     close, joint, became = may_be_it(ranked, whole)
     best = close[0] if close else best
@@ -171,7 +171,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     if whole.runs and not baseline.fit.likelihood.problem.runs:
         reasons.append("held-out runs are not judged, as no run was fitted that would tell the gauge's noise")
     if own_noise:
-        reasons.append(f"each {whole.by} was given a gauge noise of its own, as no one noise is that of all")
+        reasons.append(f"each {whole.vary[GAUGE_NOISE]} was given a gauge noise of its own, as no one noise is that of all")
     for fitted in (best, *(f for f in close if f is not best)):
         for name in at_bounds(fitted):
             there = "" if name in (q.name for q in whole.parameters) else " of the augmented experiment"

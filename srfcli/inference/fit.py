@@ -161,20 +161,21 @@ class Problem:
 
     def varied(self, run: Run) -> dict[str, str]:
         """Return what the parameters that vary are called in a run, fitted or not."""
-        return {n: f"{n}[{self.group(run)}]" for n in self.experiment.vary if n != GAUGE_NOISE}
+        return {n: f"{n}[{self.group(run, by)}]" for n, by in self.experiment.vary.items() if n != GAUGE_NOISE}
 
-    def group(self, run: Run) -> str:
-        """Return the group of a run for what varies."""
-        known = self._labels.get(run.name)
-        return known or labels(replace(self.experiment, runs=(*self.experiment.runs, run)))[run.name]
+    def group(self, run: Run, by: str) -> str:
+        """Return the group of a run for what varies with `by`."""
+        known = self._labels[by].get(run.name)
+        return known or labels(replace(self.experiment, runs=(*self.experiment.runs, run)), by)[run.name]
 
     @cached_property
-    def _labels(self) -> dict[str, str]:
-        return labels(self.experiment)
+    def _labels(self) -> dict[str, dict[str, str]]:
+        return {by: labels(self.experiment, by) for by in self.experiment.vary.values()}
 
     def noise_group(self, run: Run) -> str:
         """Return the group of runs whose gauge noise a run has; nothing where all share one."""
-        return self.group(run) if GAUGE_NOISE in self.experiment.vary else ""
+        by = self.experiment.vary.get(GAUGE_NOISE)
+        return self.group(run, by) if by else ""
 
     def local(self, run: Run, values: Mapping[str, float]) -> dict[str, float]:
         """Return parameters by name with those that vary under their own names, at what they are in this run."""
@@ -207,8 +208,11 @@ def fit_problem(
     if not names:
         raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
     _check_varying(experiment, runs, names)
-    label = labels(experiment)
-    groups = {n: list(dict.fromkeys(f"{n}[{label[run.name]}]" for run in runs)) for n in experiment.vary if n != GAUGE_NOISE}
+    groups = {}
+    for n, by in experiment.vary.items():
+        label = labels(experiment, by)
+        if n != GAUGE_NOISE:
+            groups[n] = list(dict.fromkeys(f"{n}[{label[run.name]}]" for run in runs))
     rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names for _ in groups.get(n, [n])]
     names = [own for n in names for own in groups.get(n, [n])]
     for run in runs:
@@ -225,13 +229,12 @@ def fit_problem(
 
 def _check_varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[str]) -> None:
     """Raise SrfError where what is to vary is not free, or the runs fitted are of one group."""
-    vary, by = experiment.vary, experiment.by
-    for name in vary:
+    for name, by in experiment.vary.items():
         if name not in (*names, GAUGE_NOISE):
             raise SrfError(f"'{name}' is to vary, and is not free", did_you_mean(name, [*names, GAUGE_NOISE]))
-    label = labels(experiment)
-    if vary and len({label[run.name] for run in runs}) < 2:
-        raise SrfError(f"{', '.join(vary)} cannot vary by {by}: the runs fitted have only one", "Leave `vary` out.")
+        label = labels(experiment, by)
+        if len({label[run.name] for run in runs}) < 2:
+            raise SrfError(f"{name} cannot vary by {by}: the runs fitted have only one", "Leave `vary` out.")
 
 
 @dataclass(frozen=True)
