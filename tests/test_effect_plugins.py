@@ -133,7 +133,7 @@ def test_faults_of_python_effects_are_told(returned, states, message):
         ("[parameters]", "[constants]\nk = 7\n[parameters]", "constants.k: expected a table with a value"),
         ("[parameters]", '[constants]\nn = { value = 7, unit = "N" }\n[parameters]', "'n' already has a meaning"),
         ("[parameters]", '[constants]\nk = { value = 7, unit = "X" }\n[parameters]', "unknown unit 'X'"),
-        ('kind = "effect"', 'kind = "effect"\nname = "Age"', "name: found 'Age'"),
+        ('kind = "effect"', 'kind = "effect"\nname = "Age"', 'name: found "Age"'),
         ("[parameters]", '[[checks]]\nquantity = "mu"\nat = { v = 1.0 }\nvalue = 1.0\n[parameters]', "expected 'rate'"),
         (
             "[parameters]",

@@ -13,10 +13,11 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.settings import Parameter
+from srfcli.core.toml import Node
 from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
 from srfcli.data.clock import Mask, Place, Sampling, find_sampling, kept_samples, sampling_notices
 from srfcli.data.columns import MOST_BYTES, Columns, open_source, read_columns
-from srfcli.data.description import Apparatus, Description, Node, RunDescription, ThresholdsDescription, read_description
+from srfcli.data.description import Apparatus, Description, RunDescription, ThresholdsDescription, read_description
 from srfcli.data.gauge import COLOUR_SAMPLES, GaugeNoise, find_noise
 from srfcli.data.groups import BY, GAUGE_NOISE, TRENDS, grouped
 from srfcli.data.imposed import ACCIDENTS, LOADS, FoundModulation, check_start, drive_of, find_modulation, load_of

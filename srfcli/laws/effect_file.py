@@ -233,7 +233,7 @@ class EffectReader(LawReader):
                 check_identifier(entry["name"], "state", taken=taken | _TAKEN)
                 rate, steady = (parse_expression(entry[key], known) for key in ("rate", "steady"))
             except SrfError as error:
-                raise SrfError(f"{self.path}: {where}: {error.message}", error.hint) from None
+                self.fail(where, error.message, error.hint)
             found.append(ExtraState(entry["name"], rate, steady, entry.get("logarithmic", False)))
         return tuple(found)
 

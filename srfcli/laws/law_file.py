@@ -9,14 +9,16 @@ import contextlib
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from srfcli.core.errors import ExpressionError, SrfError, did_you_mean
+from srfcli.core.errors import ExpressionError, SrfError, did_you_mean, shown
 from srfcli.core.files import parse_toml, read_text
 from srfcli.core.settings import Parameter
+from srfcli.core.toml import Node
 from srfcli.core.units import find_unit
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Check, Effect, FrictionLaw, Interface, Law, Reader, State
 
@@ -70,10 +72,11 @@ def known_symbols(kind: str, parameters: Iterable[str], states: Iterable[State] 
     return (*AGEING_SYMBOLS, *COMMON, *parameters)
 
 
-def read_toml(path: Path) -> dict[str, Any]:
+def open_law(path: Path) -> Node:
     """Return the table in a TOML file; raises `SrfError` with the place where it is not TOML."""
     try:
-        return parse_toml(read_text(path, what="a law"), path)
+        text = read_text(path, what="a law").replace("\r\n", "\n")
+        return Node(path, parse_toml(text, path), (), text)
     except SrfError as error:
         raise SrfError(error.message, error.hint or 'Text goes in quotes: mu = "mu0 + A*log(v/V0)".') from None
     except OSError as error:
@@ -82,7 +85,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def read_header(path: Path) -> tuple[str, str, str]:
     """Return kind, name and about of a law file without reading its formula."""
-    reader = LawReader(path, read_toml(path))
+    reader = LawReader(open_law(path))
     return reader.kind(), reader.name(), reader.text("about")
 
 
@@ -145,59 +148,59 @@ def check_uses(law: Law) -> None:
 class LawReader:
     """One TOML table on its way to a law."""
 
-    def __init__(self, path: Path, table: dict[str, Any]) -> None:
-        self.path, self.table = path, table
+    def __init__(self, node: Node) -> None:
+        self.node, self.path, self.table = node, node.file, node.value
+
+    def at(self, key: str, value: object = None) -> Node:
+        """Return the place of a key, as parameters.A.default or states[0], with a value."""
+        place = tuple(int(number) if number else name for number, name in re.findall(r"\[(\d+)\]|([^.\[\]]+)", key))
+        return replace(self.node, value=value, place=place)
 
     def fail(self, key: str, message: str, hint: str | None = None) -> NoReturn:
-        raise SrfError(f"{self.path}: {key}: {message}", hint)
+        self.at(key).fail(message, hint)
 
     @contextlib.contextmanager
     def placed(self, key: str = "") -> Iterator[None]:
         """Write the file, and the key, in front of an error that is raised inside."""
-        where = f"{self.path}: {key}: " if key else f"{self.path}: "
         try:
             yield
         except ExpressionError as error:
-            raise ExpressionError(where + error.message, error.hint, text=error.text, column=error.column) from None
+            told = f"{self.at(key).where}: {error.message}"
+            raise ExpressionError(told, error.hint, text=error.text, column=error.column) from None
         except SrfError as error:
-            raise SrfError(where + error.message, error.hint) from None
+            self.fail(key, error.message, error.hint)
 
     def keys(self, where: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
-        for key in table:
-            if key not in tuple(known):
-                at = f"{where}.{key}" if where else key
-                self.fail(at, "unknown key", did_you_mean(key, known))
+        self.at(where, table).keys(known)
 
     def text(self, key: str, default: str = "") -> str:
-        value = self.table.get(key, default)
-        if not isinstance(value, str):
-            self.fail(key, f"found {_shown(value)}, expected text in quotes")
-        return value
+        return self.at(key, self.table.get(key, default)).text()
 
     def number(self, where: str, value: object) -> float:
+        node = self.at(where, value)
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self.fail(where, f"found {_shown(value)}, expected a number")
+            node.expected("a number")
         try:
             return float(value)
         except OverflowError:
-            self.fail(where, f"found {_shown(value)}, which is too large", "Write it as in 1e300, or inf.")
+            node.fail(f"found {shown(value)}, which is too large", "Write it as in 1e300, or inf.")
 
     def kind(self) -> str:
         found = self.table.get("format")
         if found != FORMAT:
-            said = "nothing" if found is None else _shown(found)
+            said = "nothing" if found is None else shown(found)
             self.fail("format", f"found {said}, expected {FORMAT!r}", f'Start the file with format = "{FORMAT}".')
         kind = self.table.get("kind")
         known = (*LAW_KINDS, "effect")
         if kind not in known:
-            said = "nothing" if kind is None else _shown(kind)
+            said = "nothing" if kind is None else shown(kind)
             self.fail("kind", f"found {said}, expected one of {', '.join(known)}", did_you_mean(str(kind), known))
         return kind
 
     def name(self) -> str:
         name = self.text("name", self.path.stem)
         if not valid_name(name):
-            self.fail("name", f"found {_shown(name)}, expected small letters, digits and single dashes", "Like my-law.")
+            self.at("name", name).expected("small letters, digits and single dashes", "Like my-law.")
         return name
 
     def law(self) -> Law:
@@ -242,13 +245,13 @@ class LawReader:
     def cites(self) -> tuple[str, ...]:
         cites = self.table.get("cites", [])
         if not isinstance(cites, list) or not all(isinstance(c, str) for c in cites):
-            self.fail("cites", f"found {_shown(cites)}, expected a list of texts")
+            self.at("cites", cites).expected("a list of texts")
         return tuple(cites)
 
     def parameters(self) -> tuple[Parameter, ...]:
         table = self.table.get("parameters", {})
         if not isinstance(table, dict):
-            self.fail("parameters", f"found {_shown(table)}, expected a table", "Write [parameters].")
+            self.at("parameters", table).expected("a table", "Write [parameters].")
         return tuple(self.parameter(name, entry) for name, entry in table.items())
 
     def parameter(self, name: str, entry: object) -> Parameter:
@@ -256,13 +259,13 @@ class LawReader:
         if not isinstance(entry, dict):
             if name in (*_COMMON_KEYS, *FORMULA.values(), "states"):
                 self.fail(where, "this key stands below [parameters]", "Move it above the first [table].")
-            self.fail(where, f"found {_shown(entry)}, expected a table", f'Write {name} = {{ default = 1.0, unit = "1" }}.')
+            self.at(where, entry).expected("a table", f'Write {name} = {{ default = 1.0, unit = "1" }}.')
         self.keys(where, entry, _PARAMETER_KEYS)
         if "default" not in entry:
             self.fail(f"{where}.default", "missing", "Every parameter has a default.")
         for key in ("unit", "about"):
             if not isinstance(entry.get(key, ""), str):
-                self.fail(f"{where}.{key}", f"found {_shown(entry[key])}, expected text in quotes")
+                self.at(f"{where}.{key}", entry[key]).expected("text in quotes")
         lower, upper = self.bounds(where, entry)
         default = self.number(f"{where}.default", entry["default"])
         return Parameter(name, default, entry.get("unit", "1"), lower, upper, entry.get("about", ""))
@@ -275,19 +278,19 @@ class LawReader:
         if "lower" in entry or "upper" in entry:
             self.fail(f"{where}.bounds", "given together with lower or upper", "Keep one of the two forms.")
         if not isinstance(bounds, list) or len(bounds) != 2:
-            self.fail(f"{where}.bounds", f"found {_shown(bounds)}, expected [lower, upper]", "inf and -inf are numbers.")
+            self.at(f"{where}.bounds", bounds).expected("[lower, upper]", "inf and -inf are numbers.")
         return self.number(f"{where}.bounds", bounds[0]), self.number(f"{where}.bounds", bounds[1])
 
     def states(self) -> tuple[State, ...]:
         entries = self.table.get("states", [{}])
         if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
-            self.fail("states", f'found {_shown(entries)}, expected [{{ name = "phi", length = "D0", weight = "B" }}]')
+            self.fail("states", f'found {shown(entries)}, expected [{{ name = "phi", length = "D0", weight = "B" }}]')
         states = []
         for number, entry in enumerate(entries):
             where = f"states[{number}]"
             self.keys(where, entry, _STATE_KEYS)
             if not all(isinstance(value, str) for value in entry.values()):
-                self.fail(where, f"found {_shown(entry)}, expected texts for name, length and weight")
+                self.at(where, entry).expected("texts for name, length and weight")
             states.append(State(**entry))
         return tuple(states)
 
@@ -295,7 +298,7 @@ class LawReader:
         """Return the worked values; a formula that is not named is the first of `quantities`."""
         entries = self.table.get("checks", [])
         if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
-            self.fail("checks", f"found {_shown(entries)}, expected tables", "Write [[checks]] with two brackets.")
+            self.at("checks", entries).expected("tables", "Write [[checks]] with two brackets.")
         if entries and not quantities:
             self.fail("checks", "there is no formula to check", "Leave them out.")
         return tuple(self.check(f"checks[{i}]", entry, quantities, names) for i, entry in enumerate(entries))
@@ -308,23 +311,15 @@ class LawReader:
                 self.fail(f"{where}.{key}", "missing")
         quantity = entry.get("quantity", quantities[0])
         if quantity not in quantities:
-            found, wanted = _shown(quantity), " or ".join(repr(q) for q in quantities)
+            found, wanted = shown(quantity), " or ".join(repr(q) for q in quantities)
             self.fail(f"{where}.quantity", f"found {found}, expected {wanted}", did_you_mean(found, quantities))
         if not isinstance(entry["at"], dict):
-            self.fail(f"{where}.at", f"found {_shown(entry['at'])}, expected {{ v = 1.0, ... }}")
+            self.fail(f"{where}.at", f"found {shown(entry['at'])}, expected {{ v = 1.0, ... }}")
         self.keys(f"{where}.at", entry["at"], tuple(names))
         at = tuple((name, self.number(f"{where}.at.{name}", value)) for name, value in entry["at"].items())
         value = self.number(f"{where}.value", entry["value"])
         rtol = self.number(f"{where}.rtol", entry.get("rtol", Check.rtol))
         return Check(quantity, at, value, rtol)
-
-
-def _shown(value: object) -> str:
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):
-        return "a value too long to show"
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def template(kind: str, name: str, *, python: bool) -> str:

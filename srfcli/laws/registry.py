@@ -25,7 +25,7 @@ from srfcli.core.cache import header_key, known_headers, user_base
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import check_plain, open_plain, read_plain
 from srfcli.core.settings import Parameter
-from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, read_header, read_toml, valid_name
+from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, open_law, read_header, valid_name
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, Law, Reader
 
 GROUP = "srf.laws"
@@ -154,7 +154,7 @@ class Registry:
         if not name.endswith((".toml", ".py")):
             entry = self.find(kind, name)
             if entry.origin == BUNDLED and entry.location.suffix == ".toml":
-                return LawReader(entry.location, read_toml(entry.location)).parameters()
+                return LawReader(open_law(entry.location)).parameters()
         return self.get(kind, name).parameters
 
     def fingerprint(self, entry: Entry) -> str:
@@ -286,12 +286,12 @@ def read_entry(entry: Entry) -> Any:
 
 def read_law(path: Path) -> Law:
     """Return the law, or the effect, in a TOML file; its `kind` says which reader it needs."""
-    table = read_toml(path)
-    if table.get("kind") == "effect":
+    node = open_law(path)
+    if node.value.get("kind") == "effect":
         from srfcli.laws.effect_file import EffectReader  # imports sympy
 
-        return EffectReader(path, table).effect()
-    return LawReader(path, table).law()
+        return EffectReader(node).effect()
+    return LawReader(node).law()
 
 
 @contextlib.contextmanager
