@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 
 import srfcli
 from srfcli.cli.main import cli
-from srfcli.tasks.campaign import fit_campaign
+from srfcli.tasks.recordings import fit_campaign
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 TRUE = {"A": 0.009, "B": 0.006, "D0": 6.0}
@@ -112,7 +112,7 @@ def test_finished_rows_are_kept_when_it_is_interrupted_and_gone_on_from(monkeypa
     for seed, name in enumerate(("one", "two", "three")):
         experiment(name, seed=seed)
     asked: list[str] = []
-    import srfcli.tasks.campaign as campaign
+    import srfcli.tasks.recordings as campaign
 
     real = campaign.fit_one
 

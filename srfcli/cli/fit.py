@@ -176,7 +176,7 @@ def _fit_campaign(
     sources: Sequence[Path], place: str | None, spread: Spread, system: SystemOptions, output: OutputOptions, **options: Any
 ) -> None:
     """Fit each experiment by itself, a row each; the table is written anew whenever one is done."""
-    from srfcli.tasks.campaign import fit_campaign
+    from srfcli.tasks.recordings import fit_campaign
 
     _refuse(("profile", "sample", "draws", "vary", "by", "prior"), "one experiment")
     target = None if place is None else Path(place).expanduser()
