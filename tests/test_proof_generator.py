@@ -155,6 +155,24 @@ def test_an_effect_with_a_reference_velocity_joins_a_law_that_has_none(make_mode
     assert np.abs(made - with_it).max() < 5e-7 and np.abs(with_it - without).max() > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("effect", "fields", "own"),
+    [
+        ("slip-hardening", ("harden", "harden_x"), {"rise": 4e-3, "length": 90.0}),
+        ("frictional-heating", ("heat", "heat_tau"), {"drop": 2e-4, "cooling": 5.0}),
+        ("dilatancy", ("dilate", "drain"), {"strength": 4e-3, "drainage": 8.0}),
+        ("rate-cutoff", ("rate_cut",), {"cutoff": 0.02}),
+        ("load-lag", ("memory", "memory_tau"), {"share": 0.4, "lag_time": 2.0}),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_effects_of_laboratories_agree_with_the_fitter(make_model, tmp_path, effect, fields, own):
+    p, rig = replace(ROCK, **dict(zip(fields, own.values(), strict=True))), RIGS["rock-friction"]
+    with_it, without = (recorded(rig, q, ROCK_RUN, move(q, ROCK_RUN).u) for q in (p, ROCK))
+    made = predicted(make_model, tmp_path, p, ROCK_RUN, rig, with_it, (effect,), **own)
+    assert np.abs(made - with_it).max() < 5e-7 and np.abs(with_it - without).max() > 1e-3
+
+
 @pytest.mark.parametrize(("law", "ageing"), [slow_unless_quick(law, ageing) for law in LAWS for ageing in AGEING_LAWS])
 def test_every_law_and_ageing_law_agrees_with_the_fitter_on_the_papers_slider(make_model, tmp_path, law, ageing):
     """With an elastic interface and a mass, where the rate of the friction force and the inverse of each law are others."""

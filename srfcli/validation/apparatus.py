@@ -196,6 +196,10 @@ SIZES: Mapping[str, Mapping[str, Sizes]] = {
         "servo": (0.1, 1.0, {"servo_f": (0.05, 0.5), "servo_damping": (0.2, 0.9)}),
         "pore": (0.1, 2.0, {}),
         "creep": (3e-3, 0.1, {"creep_tau": (3.0, 60.0)}),
+        "harden": (2e-4, 4e-3, {"harden_x": (50.0, 400.0)}),
+        "heat": (5e-6, 2e-4, {"heat_tau": (0.5, 20.0)}),
+        "dilate": (2e-4, 4e-3, {"drain": (1.0, 30.0)}),
+        "rate_cut": (1 / 2000, 1 / 30, {}),
     },
     "micro": {
         "alpha": (0.005, 0.1, {}),
@@ -223,6 +227,10 @@ SIZES: Mapping[str, Mapping[str, Sizes]] = {
         "servo": (0.1, 1.0, {"servo_f": (1.0, 10.0), "servo_damping": (0.2, 0.9)}),
         "pore": (5e-4, 0.02, {}),
         "creep": (3e-3, 0.1, {"creep_tau": (0.5, 10.0)}),
+        "harden": (5e-4, 8e-3, {"harden_x": (5.0, 40.0)}),
+        "heat": (5e-6, 2e-4, {"heat_tau": (0.1, 5.0)}),
+        "dilate": (5e-4, 8e-3, {"drain": (0.1, 5.0)}),
+        "rate_cut": (1 / 2000, 1 / 30, {}),
     },
 }
 BY_LOAD = {  # nothing happens without a load that changes, or what does is a change of the baseline's parameters
@@ -247,6 +255,8 @@ def possible(varies: str, setting: Setting) -> bool:
         varies not in {"B2", *OF_AGE} or law != "two-state",
         varies != "slip_share" or ageing in ("dieterich", "perrin-rice-zheng"),
         varies != "p_age" or ageing == "dieterich",
+        varies != "dilate" or (ageing in ("dieterich", "ruina") and law != "two-state"),  # an age of D0/V
+        varies != "rate_cut" or law not in ("dieterich-cutoff", "rice-regularized"),
         varies != "M" or protocol != "stick-slip",  # which a quasi-static baseline does not have
         varies not in BESIDE_NAGATA or ageing != "nagata",
     )

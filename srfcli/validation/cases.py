@@ -148,6 +148,11 @@ OUTSIDE: tuple[Effect, ...] = (
     ),
     Effect("pore-pressure", "pore", 0.02, 0.6, listed=False, resembles=("adhesion-offset",)),
     Effect("gauge-creep", "creep", 0.003, 0.1, beside={"creep_tau": (0.1, 3.0)}, listed=False, resembles=("sensor-lag",)),
+    Effect("slip-hardening", "harden", 5e-4, 8e-3, BOTH, beside={"harden_x": (5.0, 40.0)}, listed=False,
+           resembles=("friction-drift",)),
+    Effect("frictional-heating", "heat", 5e-6, 2e-4, beside={"heat_tau": (0.05, 2.0)}, listed=False, resembles=("viscous-drag",)),
+    Effect("dilatancy", "dilate", 5e-4, 8e-3, beside={"drain": (0.05, 2.0)}, listed=False, resembles=("second-state",)),
+    Effect("rate-cutoff", "rate_cut", 1 / 2000, 1 / 30, listed=False, resembles=("viscous-drag",)),
 )  # fmt: skip
 NAMES = tuple(dict.fromkeys(e.name for e in EFFECTS))
 OUTSIDE_NAMES = tuple(e.name for e in OUTSIDE)

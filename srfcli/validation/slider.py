@@ -158,6 +158,13 @@ class Physics:
     pore: float = 0.0  # N, carried by a fluid: the asperities feel W - pore
     creep: float = 0.0  # share of the elongation that the gauge shows late
     creep_tau: float = 1.0
+    harden: float = 0.0  # harden (1 - exp(-x/harden_x)) in mu
+    harden_x: float = 30.0
+    heat: float = 0.0  # mu loses heat T, T' = (v W/(V0 W0) - T)/heat_tau
+    heat_tau: float = 1.0
+    dilate: float = 0.0  # mu gains a share -p W0/W, p' = dilate (1/phi - v/D0) - p/drain
+    drain: float = 1.0
+    rate_cut: float = 0.0  # s/um: A ln(v/V0) becomes A ln(v/V0) - A ln(1 + rate_cut v)
     nagata: float = 0.0  # phi' loses (nagata/B) phi F'/W, F the friction force
     # the track itself, which is no effect
     track: Track = SMOOTH
@@ -322,6 +329,8 @@ def at_unit_velocity(p: Physics, longest: float) -> Callable[[float, float, floa
         if local:
             m += p.topo * math.cos(wave * s + p.topo_phase) + profile(s)
             m += p.bump * math.exp(-0.5 * ((s - p.bump_x) / p.bump_w) ** 2)
+        if p.harden:
+            m += p.harden * (1 - math.exp(-s / p.harden_x))
         if drifting:
             m += p.drift_t * max(t - p.drift_t0, 0.0) + p.drift_x * max(s - p.drift_x0, 0.0)
         return m, p.A * (1 + p.B / p.mu0 * grown) if p.law == "bowden-tabor" else p.A + p.C * grown
@@ -353,27 +362,28 @@ Solve = Callable[[float, float, float, float], float]
 def friction(p: Physics) -> tuple[Solve, Solve]:
     """Return mu(x, m, a, c) = m + a h(x) + c e^x, x = ln(v/V0), of the law of `p`, and its inverse x(mu, m, a, c).
 
-    h(x) is x, -ln(1 + Va/v) under dieterich-cutoff, and asinh(exp(x + m/a)/2) - m/a under rice-regularized.
+    h(x) is x, -ln(1 + Va/v) under dieterich-cutoff, and asinh(exp(x + m/a)/2) - m/a under rice-regularized. A cut-off of the
+    rate is that of dieterich-cutoff, with ln(Va/V0) beside it.
     """
-    if p.law not in ("dieterich-cutoff", "rice-regularized"):
+    if p.law not in ("dieterich-cutoff", "rice-regularized") and not p.rate_cut:
 
         def straight(x: float, m: float, a: float, c: float) -> float:
             return m + a * x + c * math.exp(x)
 
         return straight, lambda mu, m, a, c: log_velocity(mu - m, a, c)
-    end = math.log(p.Va / p.V0)
-    cut = p.law == "dieterich-cutoff"
+    end = -math.log(p.rate_cut * p.V0) if p.rate_cut else math.log(p.Va / p.V0)
+    cut, above = p.law == "dieterich-cutoff" or p.rate_cut > 0, end if p.rate_cut else 0.0
 
     def bent(x: float, m: float, a: float, c: float) -> float:
         flow = c * math.exp(min(x, FASTEST_SLIP)) if c else 0.0
         if cut:
-            return m - a * math.log1p(math.exp(min(end - x, 700.0))) + flow
+            return m + a * (above - math.log1p(math.exp(min(end - x, 700.0)))) + flow
         return a * math.asinh(0.5 * math.exp(min(x + m / a, 700.0))) + flow
 
     def plain(mu: float, m: float, a: float) -> float:
         """Return x without drag: a closed form."""
         if cut:
-            R = (m - mu) / a  # ln(1 + Va/v); 0 and below at no velocity
+            R = (m - mu) / a + above  # ln(1 + Va/v); 0 and below at no velocity
             return min(end - R - math.log(-math.expm1(-R)), FASTEST_SLIP) if R > 0 else FASTEST_SLIP
         y = max(mu / a, 1e-12)
         return min(y + math.log(-math.expm1(-2 * y)) - m / a, FASTEST_SLIP)
@@ -558,12 +568,12 @@ class Slider:
         self._aged, self._aged2, (self._resistance, _) = ageing(p), second_ageing(p), friction(p)
         extra = {
             "ln_phi2": p.B2, "Wm": p.memory, "gauge": p.lag, "stage": p.drive_tau, "X": p.ripple, "Ws": p.servo,
-            "Ws_dot": p.servo, "late": p.creep,
+            "Ws_dot": p.servo, "late": p.creep, "T": p.heat, "p": p.dilate,
         }  # fmt: skip
         self.names = (*self.contact.names, "ln_phi", "s", *(name for name, size in extra.items() if size))
         self._age = len(self.contact.names)
         where = [self.names.index(name) if name in self.names else 0 for name in extra]  # 0 is always mechanical
-        self._age2, self._delay, self._gauge, self._stage, self._X, self._servo, _, self._late = where
+        self._age2, self._delay, self._gauge, self._stage, self._X, self._servo, _, self._late, self._heat, self._pore = where
 
     def sliding(self, t: float, y: list[float]) -> tuple[Sliding, Felt]:
         """Return slip velocity, elongation and friction force, and the load at the asperities, at time t in s."""
@@ -577,6 +587,11 @@ class Slider:
             W, rate = y[self._servo], y[self._servo + 1]
             felt = felt._replace(W=felt.W + p.servo * (W - felt.W), rate=felt.rate + p.servo * (rate - felt.rate))
         m, a = self._terms(t, y[self._age + 1], y[self._age], y[self._age2] if self._age2 else 0.0, felt.W)
+        if self._heat:
+            m -= p.heat * y[self._heat]
+        if self._pore:
+            share = 1 - y[self._pore] * self.plan.W0 / felt.W
+            m, a = share * m, share * a
         K = p.spring_under(felt.imposed)
         return self.contact.slide(y, m, a, felt.W, -p.cross * felt.excess, K), felt
 
@@ -620,6 +635,10 @@ class Slider:
             out += (rate, w * (w * (self._felt(t).W - W) - 2 * p.servo_damping * rate))
         if self._late:
             out.append((u - y[self._late]) / p.creep_tau)
+        if self._heat:
+            out.append((v * felt.W / (p.V0 * self.plan.W0) - y[self._heat]) / p.heat_tau)
+        if self._pore:
+            out.append(p.dilate * (math.exp(-y[self._age]) - v / p.D0) - y[self._pore] / p.drain)
         return out
 
     def shown(self, t: float, y: list[float]) -> float:
@@ -633,8 +652,13 @@ class Slider:
         W, K = felt.W, self.p.spring_under(felt.imposed)
         ln_phi, ln_phi2 = steady_ages(p, V)
         m, a = self._terms(0.0, 0.0, ln_phi, ln_phi2, W)
+        warm = V * W / (p.V0 * self.plan.W0)
+        m -= p.heat * warm
         F = (W + p.Wa) * self._resistance(math.log(V / p.V0), m, a, p.drag)
-        extra = {"ln_phi2": ln_phi2, "Wm": W, "gauge": F / K, "stage": V, "X": 0.0, "Ws": W, "Ws_dot": 0.0, "late": F / K}
+        extra = {
+            "ln_phi2": ln_phi2, "Wm": W, "gauge": F / K, "stage": V, "X": 0.0, "Ws": W, "Ws_dot": 0.0, "late": F / K, "T": warm,
+            "p": 0.0,  # at an age of D0/V
+        }  # fmt: skip
         mechanical = self.contact.steady(V, F, W, K)
         return [*mechanical, ln_phi, 0.0, *(extra[name] for name in self.names[len(mechanical) + 2 :])]
 
@@ -697,7 +721,7 @@ def _through(slider: Slider, solver: ode, trace: Trace, end: float) -> Array | N
 # Stability of steady sliding by the slider's own equations: differences of its rates, and their eigenvalues.
 
 UNSTEADY: dict[str, Any] = {
-    "track": Track(), "topo": 0.0, "bump": 0.0, "drift_t": 0.0, "drift_x": 0.0, "ripple": 0.0, "drive_tau": 0.0,
+    "track": Track(), "topo": 0.0, "bump": 0.0, "drift_t": 0.0, "drift_x": 0.0, "ripple": 0.0, "drive_tau": 0.0, "harden": 0.0,
 }  # fmt: skip
 UNFELT_DELAYS: dict[str, Any] = {"lag": 0.0, "creep": 0.0, "servo": 0.0}  # of gauge and servo: steady sliding does not feel them
 SIZES_OF_LOAD = 60  # that are tried, evenly in their logarithm
