@@ -478,6 +478,13 @@ def test_real_recordings(path: Path, stiffness: str, unit: str) -> None:
     assert f"W [{unit}]" in srf("check", ".", "--no-simulate").stdout
 
 
+@pytest.mark.parametrize("names", [("\u03c4 (MPa)", "\u03c3n (MPa)"), ("Shr_str [MPa]", "Nor_str [MPa]")])
+def test_greek_letters_and_abbreviations_name_stresses(names: tuple[str, str], step: dict[str, np.ndarray]) -> None:
+    table(["time (s)", "disp (um)", *names], [step["t"], step["x"], SIGMA * step["mu"], step["sigma"]])
+    said = srf("new", "run1.csv", "--stiffness", "40 MPa/mm").stderr
+    assert f"{names[0]!r} is the shear stress" in said and f"{names[1]!r} is the normal stress" in said
+
+
 @pytest.mark.parametrize("heading", ["Load point \u00b5m", "Load point_\u03bcm", "Load point (\u00b5m)"])
 def test_a_micro_sign_is_read(heading: str, step: dict[str, np.ndarray]) -> None:
     table(

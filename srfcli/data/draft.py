@@ -47,12 +47,12 @@ NAMED = {  # role -> what headings call it, in small letters without their unit;
     ),
     "normal_stress": (
         "normal_stress", "effective_normal_stress", "eff_normal_stress", "norm_stress", "sigma_n", "sigman", "sig_n", "sign",
-        "sigma", "sn", "ns", "nor_stress",
+        "sigma", "sn", "ns", "nor_stress", "nor_str",
     ),
     "normal_load": ("normal_load", "normal_force", "fn", "f_n", "norm_force", "load", "n", "w"),
     "elongation": ("elongation", "spring_elongation", "deflection", "spring_deflection", "u"),
     "force": ("force", "shear_force", "friction_force", "tangential_force", "shear_load", "spring_force", "fs", "ft", "f"),
-    "shear_stress": ("shear_stress", "shear", "tau", "ss", "shr_stress"),
+    "shear_stress": ("shear_stress", "shear", "tau", "ss", "shr_stress", "shr_str"),
     "friction": (
         "friction", "friction_coefficient", "coefficient_of_friction", "friction_coeff", "apparent_friction", "mu", "cof",
         "fnorm",
@@ -262,6 +262,7 @@ def _spelled(heading: str) -> tuple[str, str | None]:
     """Return a heading's name in small letters and its unit, from brackets or a suffix; None where it has none."""
     name, unit = split_heading(heading)
     latin = re.sub("[\u00b5\u03bc]", "mu", re.sub("[\u00b5\u03bc](?=[a-z])", "u", name.strip().lower()))  # um, and mu alone
+    latin = latin.replace("\u03c4", "tau").replace("\u03c3", "sigma")
     plain = re.sub(r"[^a-z0-9/]+", "_", latin).strip("_")
     if unit is not None or any(plain in names for names in NAMED.values()):  # the n of sigma_n is no newton
         return plain.replace("/", "_"), unit
