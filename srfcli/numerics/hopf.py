@@ -15,6 +15,7 @@ from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel
 from srfcli.core.errors import Status
 
 WORST_RESIDUAL = 1e-9
+DEGENERATE = 1e-12  # of a Lyapunov coefficient, below which it is rounding: as of the classical laws without mass and compliance
 SCANNED_LOADS = np.geomspace(1e-9, 1e9, 1801)  # times K * 1 um: loads at which a non-polynomial determinant is looked at
 
 
@@ -35,9 +36,11 @@ class HopfPoint:
     residual: float
 
     @property
-    def supercritical(self) -> bool:
-        """True where stick-slip grows from zero amplitude."""
-        return self.lyapunov < 0
+    def criticality(self) -> str:
+        """Return supercritical where stick-slip grows from zero amplitude, subcritical, or degenerate at third order; "" of NaN."""
+        if abs(self.lyapunov) < DEGENERATE:
+            return "degenerate"
+        return "supercritical" if self.lyapunov < 0 else "subcritical" if self.lyapunov > 0 else ""
 
 
 def hopf_points(model: GeneratedModel, p: Array) -> list[HopfPoint]:

@@ -67,7 +67,7 @@ class LinearResult(Result):
             Column("Omega_rigid", "rad/s", "Omega_c for kappa to infinity (closed form)"),
             Column("crossing_rate", "1/(N s)", "d Re(s)/dW0 at the root", ".4g"),
             Column("lyapunov", "1", "Re c/Omega of z' = i Omega z + c z |z|^2, delta ln v = 2 Re z", ".4g"),
-            Column("criticality", "", "supercritical or subcritical Hopf bifurcation"),
+            Column("criticality", "", "supercritical, subcritical or, at third order, degenerate Hopf bifurcation"),
             Column("leading", "", "all other roots are stable"),
         )
         cells = [tuple(row.get(c.name) for c in columns) for row in self.points]

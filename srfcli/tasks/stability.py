@@ -147,7 +147,7 @@ def _point_cells(point: HopfPoint, value: dict[str, float]) -> dict[str, Any]:
     cells: dict[str, Any] = {"W0": point.W0, "K_over_W0": value["K"] / point.W0, "Omega_c": point.Omega}
     cells["crossing_rate"], cells["lyapunov"], cells["leading"] = point.crossing_rate, point.lyapunov, point.leading
     known = math.isfinite(point.lyapunov)
-    cells["criticality"] = ("supercritical" if point.supercritical else "subcritical") if known else None
+    cells["criticality"] = point.criticality or None
     if "D0" in value:
         cells["Omega_reduced"] = value["D0"] * point.Omega / value["V"]
     return cells | {"status": "ok" if known else "no Lyapunov coefficient: the Jacobian overflows"}
