@@ -37,7 +37,7 @@ class HopfPoint:
 
     @property
     def criticality(self) -> str:
-        """Return supercritical where stick-slip grows from zero amplitude, subcritical, or degenerate at third order; "" of NaN."""
+        """Return supercritical (stick-slip grows from zero amplitude), subcritical, or degenerate at third order; "" of NaN."""
         if abs(self.lyapunov) < DEGENERATE:
             return "degenerate"
         return "supercritical" if self.lyapunov < 0 else "subcritical" if self.lyapunov > 0 else ""
