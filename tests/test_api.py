@@ -132,8 +132,13 @@ def test_an_experiment_is_read_checked_and_fitted(tmp_path: Path, monkeypatch: p
     options = ("--free", "mu0,D0", "--track", "smooth")
     assert [list(r) for r in found.table.rows] == rows_of("fit", "steps", *options)
     assert found.values["D0"] == pytest.approx(0.402, abs=5 * found.stderr["D0"])
-    with pytest.raises(srf.SrfError, match="several panels"):
-        found.plot(ax=object())  # type: ignore[arg-type]
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    here, there = figure.subplots(1, 2)
+    assert found.plot(ax=here) is told.plot(ax=there) is figure
+    panels = [{ax.get_ylabel().split("\n")[0] for ax in part.axes} for part in figure.subfigs]
+    assert panels[0] == {"elongation", "residual"} and panels[1] >= {"V"} and len(figure.axes) == sum(map(len, panels))
+    with pytest.raises(srf.SrfError, match="placed by hand"):
+        found.plot(ax=figure.add_axes((0, 0, 1, 1)))
 
 
 def test_comparing_names_what_was_matched() -> None:

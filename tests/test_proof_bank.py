@@ -27,9 +27,9 @@ from srfcli.validation.apparatus import (
     settings,
 )
 from srfcli.validation.cases import (
-    KINDS,
     NAMES,
     OUTSIDE_NAMES,
+    PAPER_KINDS,
     SEAL,
     WIDE_KINDS,
     acting,
@@ -132,7 +132,7 @@ def test_a_truth_survives_json(quick, tmp_path):
 
 
 def test_recipes_draw_what_is_asked_for():
-    kinds, odd = {k: 0 for k in KINDS}, 0
+    kinds, odd = {k: 0 for k in PAPER_KINDS}, 0
     for seed in range(400):
         recipe = draw_recipe(np.random.default_rng(seed))
         count = len(recipe.effects)

@@ -38,7 +38,7 @@ from srfcli.validation.blind import (
     to_line,
     write_answers,
 )
-from srfcli.validation.cases import BANKS, KINDS, NAMES, WIDE_KINDS, make_case, plan_bank, possible_pairs, variants
+from srfcli.validation.cases import BANKS, NAMES, PAPER_KINDS, WIDE_KINDS, make_case, plan_bank, possible_pairs, variants
 from srfcli.validation.gauge import Gauge
 from srfcli.validation.marks import INVISIBLE, Rate, Sight, accepted, calibration, deviation, mark, quantile, see, stands_out
 from srfcli.validation.slider import Physics, Plan, move
@@ -575,11 +575,11 @@ def test_a_diagnosis_is_given_the_case_and_nothing_else(new_trial, tmp_path):
 
 
 def test_kinds_of_a_bank():
-    names = {k: {len(p) for _, p in plan_bank(40, 3, kinds=[k])} for k in KINDS}
+    names = {k: {len(p) for _, p in plan_bank(40, 3, kinds=[k])} for k in PAPER_KINDS}
     assert names == {"none": {0}, "single": {1}, "pair": {2}, "outside": {1}}
     mixed = plan_bank(100, 3, kinds=["none", "outside"])
     assert (len(mixed), sum(not p for _, p in mixed)) == (100, 56)
-    assert plan_bank(200, 5, kinds=KINDS) == plan_bank(200, 5)
+    assert plan_bank(200, 5, kinds=PAPER_KINDS) == plan_bank(200, 5)
     with pytest.raises(SrfError, match="unknown kind of case 'sngle'"):
         plan_bank(5, 1, kinds=["sngle"])
     with pytest.raises(SrfError, match="no cases of the kind 'ageing'") as caught:

@@ -34,7 +34,7 @@ srf check experiment/ --no-simulate                check the files only, without
 srf check experiment/ --fail-on gap --fail-on reset && srf fit experiment/
 srf check experiment/ --json | jq .meta.runs       all that was found
 """
-KINDS = ("steps", "shs", "oscillation")
+DRAFT_KINDS = ("steps", "shs", "oscillation")
 
 
 @click.command("new", cls=SrfCommand, epilog=NEW)
@@ -43,7 +43,7 @@ KINDS = ("steps", "shs", "oscillation")
     "--stiffness", metavar="K", help="Stiffness of the machine: '0.21 N/um', '55 MPa/mm', or friction per um, '5e-3 1/um'."
 )
 @click.option(
-    "--kind", type=click.Choice(KINDS), help="Velocity steps, slide-hold-slide, or a load that oscillates; else as found."
+    "--kind", type=click.Choice(DRAFT_KINDS), help="Velocity steps, slide-hold-slide, or an oscillating load; else as found."
 )
 @click.option(
     "--column", "columns", multiple=True, metavar="ROLE=HEADING", help="Which column plays a role: 'shear_stress=S [kPa]'."

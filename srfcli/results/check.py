@@ -14,9 +14,10 @@ import numpy as np
 from srfcli.core.units import from_base
 from srfcli.data.gauge import GaugeNoise, colour_text
 from srfcli.data.values import Experiment, shown_unit
+from srfcli.results import plots
 from srfcli.results.figures import recordings
 from srfcli.results.report_text import joined
-from srfcli.results.tables import Column, Result, Table, own_figure
+from srfcli.results.tables import Column, Result, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,8 +108,7 @@ class CheckResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return each run's observable, drive and load over time, flagged samples marked, proposed corrections drawn."""
-        own_figure(ax, "a check")
-        return recordings(self.runs, title=self.experiment.title)
+        return plots.in_place(ax, lambda: recordings(self.runs, title=self.experiment.title))
 
 
 # The tables of `srf check`: all columns for programs, rounded ones that fit a page for readers, and everything for JSON.

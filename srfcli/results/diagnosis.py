@@ -24,10 +24,11 @@ from srfcli.diagnosis.residual_scan import Location
 from srfcli.diagnosis.search import Fitted
 from srfcli.diagnosis.verdict import Diagnosis, added, at_bounds
 from srfcli.laws.registry import Registry
+from srfcli.results import plots
 from srfcli.results.provenance import Provenance, write_result
 from srfcli.results.report_figures import loads_figure, run_figure, trace
 from srfcli.results.report_text import unit_text
-from srfcli.results.tables import Column, Result, Table, json_text, own_figure, plain_value, to_csv
+from srfcli.results.tables import Column, Result, Table, json_text, plain_value, to_csv
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -243,9 +244,11 @@ class DiagnosisResult(Result):
         Raises
         ------
         SrfError
-            Where Matplotlib is not installed, or an axes is given: the figure has several.
+            Where Matplotlib is not installed, or an axes that stands in no grid is given.
         """
-        own_figure(ax, "a diagnosis")
+        return plots.in_place(ax, self._panels)
+
+    def _panels(self) -> Figure:
         made = self._material
         if not made["runs"]:
             return loads_figure(made["thresholds"][0])

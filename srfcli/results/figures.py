@@ -92,6 +92,8 @@ def settle(figure: Figure) -> None:
     """Fix the layout at rounded positions: the last digits of the layout solver differ from run to run."""
     from matplotlib import rc_context
 
+    if not hasattr(figure, "set_layout_engine"):  # a part of somebody's own figure
+        return
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)

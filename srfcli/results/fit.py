@@ -27,7 +27,7 @@ from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
 from srfcli.results.figures import draw_loads, stacked
 from srfcli.results.report_text import bracketed, unit_text, with_unit
-from srfcli.results.tables import STATUS, Column, Result, Table, cell_text, own_figure
+from srfcli.results.tables import STATUS, Column, Result, Table, cell_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -379,7 +379,9 @@ class FitResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return each run's recording and prediction above its residual, and each table's measured and computed loads."""
-        own_figure(ax, "a fit")
+        return plots.in_place(ax, self._panels)
+
+    def _panels(self) -> Figure:
         fit, runs = self.found.fit, {run.name: run for run in self.experiment.runs}
         count = len(self._observables) + len(fit.tables)
         columns = min(count, 2)
@@ -653,7 +655,9 @@ class ThresholdFitResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the measured critical loads beside those of the best fit over V, and the lowest chi2 against evaluations."""
-        own_figure(ax, "a fit of critical loads")
+        return plots.in_place(ax, self._panels)
+
+    def _panels(self) -> Figure:
         table, best = self.found.table, min(self.found.methods, key=lambda m: m.cost)
         loads = np.where(best.match.missing, np.nan, best.match.loads)
         with plots.house_style():
@@ -762,13 +766,12 @@ class CampaignResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return A - B with its error over the velocity of each experiment, those that have no fit left out."""
-        own_figure(ax, "a campaign")
         known = [row for row in self.rows if row.get("A_minus_B") is not None]
         if not known:
             raise SrfError("no experiment of the campaign has A and B: there is nothing to draw", "Leave --plot out.")
         laws = list(dict.fromkeys(str(row["law"]) for row in known))
         title = plots.name_text("; ".join(laws), wide=True)
-        with plots.one_panel(None, title=title, size=(max(6.0, 1.0 + 0.3 * len(known)), 4.2)) as (figure, axes):
+        with plots.one_panel(ax, title=title, size=(max(6.0, 1.0 + 0.3 * len(known)), 4.2)) as (figure, axes):
             place = range(len(known))
             values, errors = ([row[key] for row in known] for key in ("A_minus_B", "A_minus_B_stderr"))
             errors = [e if e is not None and math.isfinite(e) else math.nan for e in errors]

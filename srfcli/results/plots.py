@@ -10,7 +10,8 @@ import logging
 import math
 import sys
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -21,6 +22,7 @@ from srfcli.laws.law_file import RESERVED
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.gridspec import SubplotSpec
 
 Values = Collection[Any]  # a list or an array of numbers; None or NaN is a gap
 
@@ -119,11 +121,38 @@ def name_text(name: str, *, narrow: bool = False, wide: bool = False) -> str:
     return (words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$")
 
 
+_PLACE: ContextVar[Axes | None] = ContextVar("axes in whose place the next figure is drawn", default=None)
+
+
+def in_place(ax: Axes | None, draw: Callable[[], Figure]) -> Figure:
+    """Return the figure of several panels that `draw` makes; drawn in the place of `ax` if that is given, the figure that has it.
+
+    Raises SrfError for an axes that stands in no grid.
+    """
+    if ax is None:
+        return draw()
+    if ax.get_subplotspec() is None:
+        raise SrfError("an axes that was placed by hand has no room for several panels", "Take one of figure.subplots().")
+    figure, place = cast("Figure", ax.figure), _PLACE.set(ax)
+    if hasattr(figure, "set_layout_engine") and figure.get_layout_engine() is None:
+        figure.set_layout_engine("constrained")  # which gives titles and names of panels room
+    try:
+        draw()
+    finally:
+        _PLACE.reset(place)
+    return figure
+
+
 def bare_figure(size: tuple[float, float] | None = None) -> Figure:
-    """Return a figure without panels, which a notebook shows even where nobody has imported pyplot."""
+    """Return a figure without panels, which a notebook shows even where nobody has imported pyplot; `in_place` a part of one."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    if (ax := _PLACE.get()) is not None:
+        part, spec = cast("Figure", ax.figure), cast("SubplotSpec", ax.get_subplotspec())
+        ax.remove()
+        _PLACE.set(None)
+        return cast("Figure", part.add_subfigure(spec))
     figure = Figure(figsize=size)
     FigureCanvasAgg(figure)
     vars(figure)["_repr_png_"] = lambda: figure_bytes(figure, ".png", dpi=SCREEN)
@@ -188,7 +217,7 @@ def heading(figure: Figure, text: str) -> None:
     if not text:
         return
     lines = [broken for line in text.split("\n") for broken in _broken(line, figure, (1 - 2 * MARGIN) * figure.bbox.width)]
-    figure.set_figheight(figure.get_figheight() + LINE * len(lines[1:]))
+    _grow(figure, LINE * len(lines[1:]))
     figure.suptitle("\n".join(lines), x=MARGIN, ha="left", fontsize=HEADING, linespacing=1.3)
 
 
@@ -207,13 +236,19 @@ def _broken(line: str, figure: Figure, width: float) -> list[str]:
     return lines
 
 
+def _grow(figure: Figure, inches: float) -> None:
+    """Make a figure higher, unless it is a part of somebody's own."""
+    if hasattr(figure, "set_figheight"):
+        figure.set_figheight(figure.get_figheight() + inches)
+
+
 def names_below(figure: Figure, handles: Sequence[Any], names: Sequence[str], **more: Any) -> None:
     """Name curves below the axes, where the names cover nothing; the figure grows by their rows."""
     if not names:
         return
     widest = max(len(n.replace("$", "").replace("_", "")) for n in names) * NAME_WIDTH + HANDLE
-    columns = max(1, min(len(names), int(figure.get_figwidth() / widest)))
-    figure.set_figheight(figure.get_figheight() + NAME_ROW * -(-len(names) // columns))
+    columns = max(1, min(len(names), int(figure.bbox.width / figure.dpi / widest)))
+    _grow(figure, NAME_ROW * -(-len(names) // columns))
     figure.legend(
         handles, names, loc="outside lower center", ncols=columns, fontsize=NAME_OFFSET,
         **{"handlelength": 2.8, "columnspacing": 1.4, **more},

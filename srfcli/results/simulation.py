@@ -21,7 +21,7 @@ from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.simulate import Trace, stick_slip
 from srfcli.results import plots
 from srfcli.results.figures import envelope
-from srfcli.results.tables import Column, Result, Table, own_figure
+from srfcli.results.tables import Column, Result, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -214,7 +214,9 @@ class SimulationResult(Result):
         A recording, or a gauge's readings, are drawn behind the simulated observable. Velocities are on a logarithmic axis; a
         drive at rest is not drawn.
         """
-        own_figure(ax, "a simulation")
+        return plots.in_place(ax, self._panels)
+
+    def _panels(self) -> Figure:
         alone = len(self.records) == 1
         panels = [_observable, _velocities, _load]
         if alone and self.records[0].job.observable != "friction":

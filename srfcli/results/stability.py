@@ -16,7 +16,7 @@ from srfcli.core.errors import Status, worst
 from srfcli.numerics.hopf import critical_point
 from srfcli.results import plots
 from srfcli.results.figures import gains
-from srfcli.results.tables import STATUS, Column, Result, Table, own_figure
+from srfcli.results.tables import STATUS, Column, Result, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -171,10 +171,11 @@ class ResponseResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return gain and phase of each quantity over the parameter that was swept."""
-        own_figure(ax, "a response")
         drawn = {label: getattr(self.response, name) for name, (_, _, label) in QUANTITIES.items()}
         label = plots.axis_label(self.name, _swept(self.system, self.name).unit)
-        return gains(self.values, drawn, xlabel=label, logx=spread(self.values), title=self._figure_title)
+        return plots.in_place(
+            ax, lambda: gains(self.values, drawn, xlabel=label, logx=spread(self.values), title=self._figure_title)
+        )
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -311,7 +312,6 @@ class PeriodicResult(Result):
         """Return one period of elongation, slip velocity, ages, friction and load, a panel for each."""
         from srfcli.numerics.floquet import waveforms
 
-        own_figure(ax, "a periodic state")
         r, model = self.state, self.system.model
         waves = waveforms(model, r.p, r.orbit, 400)
         # the period closes: its end is its beginning
@@ -320,10 +320,10 @@ class PeriodicResult(Result):
         ages = {n[3:]: np.exp(values) for n, values in column.items() if n.startswith("ln_") and n != "ln_v"}
         verdict = ("stable" if r.stable else "unstable") if r.found else "not converged"
         title = plots.titled(f"{model.title}, {verdict}", self.table.parameters)
-        return plots.orbit(
+        return plots.in_place(ax, lambda: plots.orbit(
             tau, u=closed(waves.u), v=np.exp(column["ln_v"]), states=ages, mu=closed(waves.mu), W=closed(waves.W),
             title=title,
-        )  # fmt: skip
+        ))  # fmt: skip
 
 
 # Critical loads under modulation: points at given velocities, and the boundary as curves.

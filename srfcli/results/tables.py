@@ -302,12 +302,12 @@ class Result(ABC):
         Parameters
         ----------
         ax : matplotlib.axes.Axes, optional
-            Axes to draw in; a figure of its own if left out.
+            Axes to draw in, or in whose place several panels are drawn; a figure of its own if left out.
 
         Raises
         ------
         SrfError
-            Where Matplotlib is not installed, or a figure of several panels is asked for in one axes.
+            Where Matplotlib is not installed, or several panels are asked for in an axes that stands in no grid.
         """
 
     @property
@@ -372,9 +372,3 @@ def load_xarray() -> Any:
     except ImportError as error:
         raise SrfError("to_xarray needs xarray, which is not installed", 'pip install "srfcli[frames]"') from error
     return xarray
-
-
-def own_figure(ax: Axes | None, what: str) -> None:
-    """Raise SrfError where a figure of several panels is asked for in one axes."""
-    if ax is not None:
-        raise SrfError(f"the figure of {what} has several panels, and one axes was given", "Leave out ax.")

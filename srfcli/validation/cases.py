@@ -169,8 +169,8 @@ def variants(name: str) -> tuple[Effect, ...]:
 
 # What a case is made of, drawn from its seed: laws around those of the examples, effects, protocol, track and gauge.
 
-KINDS = ("none", "single", "pair", "outside")
-WIDE_KINDS = (*KINDS, "ageing", "one-run")  # another ageing law is stated; an effect acts in one run
+PAPER_KINDS = ("none", "single", "pair", "outside")
+WIDE_KINDS = (*PAPER_KINDS, "ageing", "one-run")  # another ageing law is stated; an effect acts in one run
 BANKS = ("paper", "wide")
 TRACKS = {"smooth": (False, False), "shared": (True, False), "rough": (True, True)}  # whether rough, and each run's own
 KIND_SHARES = (0.25, 0.4, 0.15, 0.2)  # of the kinds, where none is asked for
@@ -364,7 +364,7 @@ def _sizes(rng: np.random.Generator, count: int, asked: float | None) -> tuple[f
 
 def _chosen(rng: np.random.Generator, asked: Asked) -> tuple[Effect, ...]:
     """Return the effects by name, or as many as the kind has."""
-    drawn_kind = str(rng.choice(KINDS, p=KIND_SHARES))
+    drawn_kind = str(rng.choice(PAPER_KINDS, p=KIND_SHARES))
     order = [str(n) for n in rng.permutation(NAMES)]
     outside = str(rng.choice(OUTSIDE_NAMES))
     names = asked.effects
@@ -803,7 +803,7 @@ def plan_bank(n: int, seed: int, *, bank: str = "paper", kinds: Sequence[str] | 
     """
     check_kinds(kinds or (), bank)
     rng, wide = np.random.default_rng([seed, 2]), bank == "wide"
-    every, shares = (WIDE_KINDS, WIDE_SHARES) if wide else (KINDS, KIND_SHARES)
+    every, shares = (WIDE_KINDS, WIDE_SHARES) if wide else (PAPER_KINDS, KIND_SHARES)
     counts = dict(zip(every, _counts(n, every if kinds is None else kinds, every, shares), strict=True))
     effects: dict[str, list[tuple[str, ...]]] = {
         "single": [(name,) for name in NAMES],
@@ -821,7 +821,7 @@ def plan_bank(n: int, seed: int, *, bank: str = "paper", kinds: Sequence[str] | 
 
 def check_kinds(kinds: Sequence[str], bank: str) -> None:
     """Raise SrfError for a kind of case that a bank does not have."""
-    every = WIDE_KINDS if bank == "wide" else KINDS
+    every = WIDE_KINDS if bank == "wide" else PAPER_KINDS
     strange = [k for k in kinds if k not in every]
     if strange and strange[0] in WIDE_KINDS:
         raise SrfError(f"the bank of the paper has no cases of the kind '{strange[0]}'", "srf prove --bank wide has them.")

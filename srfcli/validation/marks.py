@@ -384,14 +384,14 @@ def _cells(found: Rate) -> tuple[Any, ...]:
     return (found.hits, found.count, found.share, *found.interval)
 
 
-TRACKS = ((False, False, "smooth"), (True, False, "one field for all runs"), (True, True, "a field of each run's own"))
+FIELDS = ((False, False, "smooth"), (True, False, "one field for all runs"), (True, True, "a field of each run's own"))
 
 
 def confusion(marks: Sequence[Mark]) -> Table:
     """Return true kinds against verdicts; `right` counts the effects too, where they are named."""
     columns = (Column("concealed", ""), Column("cases"), *map(Column, VERDICTS), Column("right"), Column("class_right"))
     rows = []
-    for kind, (rough, own, told) in product(WIDE_KINDS, TRACKS):
+    for kind, (rough, own, told) in product(WIDE_KINDS, FIELDS):
         chosen = [m for m in marks if m.kind == kind and m.rough == rough and m.own_track == own]
         if chosen:
             counts = [sum(m.answer.verdict == v for m in chosen) for v in VERDICTS]
