@@ -333,3 +333,16 @@ def test_a_concealed_servo_is_found_where_it_is_asked_for(tmp_path: Path) -> Non
     fitted = found.diagnosis.final.fit.values
     for name, own in (("share", "servo"), ("natural", "servo_f"), ("damping", "servo_damping")):
         assert fitted[name] == pytest.approx(truth[own], rel=0.05)
+
+
+def test_an_effect_is_refused_where_what_it_calls_steady_is_not(make_model) -> None:
+    """Dilatancy is drained in steady sliding at an age of D0/v, which perrin-rice-zheng has not."""
+    for ageing in ("dieterich", "ruina"):
+        make_model(
+            law="dieterich-ruina", ageing=ageing, interface="rigid", inertia=False, effects=("dilatancy",), stability=False
+        )
+    with pytest.raises(SrfError, match="'suction' is not steady at 0 under the ageing law 'perrin-rice-zheng'"):
+        make_model(
+            law="dieterich-ruina", ageing="perrin-rice-zheng", interface="rigid", inertia=False, effects=("dilatancy",),
+            stability=False,
+        )  # fmt: skip

@@ -373,6 +373,7 @@ class _Builder:
         resting = [u_rest, V][: len(unknowns) - len(at_drive)]
         steady = [self.settled(e, u_rest, mu_ss) for e in (*resting, *at_drive)]
         for extra in self.extras:
+            self.check_steady(extra)
             names.append(f"ln_{extra.name}" if extra.logarithmic else extra.name)
             unknowns.append(s(extra.name))
             rate = self.extra_rate(extra)
@@ -406,6 +407,23 @@ class _Builder:
             mu=self.parts.mu,
             steady=tuple(steady),
         )
+
+    def check_steady(self, extra: ExtraState) -> None:
+        """Raise SrfError where an effect's own unknown is not steady under these laws at the value that the effect states."""
+        s = symbol
+        still: dict[sp.Symbol, sp.Expr] = {s(n): sp.S.Zero for n in ("W_dot", "mu_dot", "F_dot_over_W")}
+        still |= {s("W"): s("W0"), **{s(e.name): e.steady for e in self.extras}, **dict(zip(self.phis, self.steady, strict=True))}
+        terms = sp.Add.make_args(sp.expand(extra.rate.subs(still).subs(s("W"), s("W0"))))
+        values = {s(p.name): to_base(p.default, p.unit) for p in self.system.parameters}
+        if {*sum(terms, sp.S.Zero).free_symbols} - {*values, s("v")}:
+            return  # it depends on what is known in motion alone
+        for v in CHECKED_VELOCITIES:
+            at = [float(term.subs({**values, s("v"): v})) for term in terms]
+            if abs(sum(at)) > 1e-9 * sum(map(abs, at)):
+                raise SrfError(
+                    f"'{extra.name}' is not steady at {extra.steady} under the ageing law '{self.system.ageing.name}'",
+                    "The effect holds for ageing laws whose age is D0/v in steady sliding, as that of dieterich.",
+                )
 
     def settled(self, formula: sp.Expr, u_rest: sp.Expr, mu_ss: sp.Expr) -> sp.Expr:
         """Return the value of a formula where a run begins: in steady sliding at V under W0, with elongation `u_rest`."""
