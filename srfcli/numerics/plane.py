@@ -127,15 +127,13 @@ class MapAxis:
 
     def samples(self) -> Array:
         """Return the values of the quantity, both ends exactly, (count,)."""
-        return self._scale.samples(self.count)
-
-    @property
-    def _scale(self) -> Axis:
-        return Axis(self.name, self.lo, self.hi, self.log)
+        return Axis(self.name, self.lo, self.hi, self.log).samples(self.count)
 
     def between(self, steps: Array) -> Array:
         """Return the quantity at places given in grid steps, whole or not."""
-        return self._scale.value(np.asarray(steps) / (self.count - 1))
+        share = np.asarray(steps) / (self.count - 1)
+        inside = self.lo * (self.hi / self.lo) ** share if self.log else self.lo + share * (self.hi - self.lo)
+        return np.where(share == 1.0, self.hi, inside)
 
     def parameter(self, model: GeneratedModel, base: Array, values: Array) -> Array:
         """Return the moved parameter at `values` of the quantity."""
