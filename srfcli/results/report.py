@@ -315,10 +315,10 @@ def scores(matter: Matter) -> Markup:
         rows.append([s["effect"], number(s.get("gain")), size, percent(s.get("tolerance")), least])
     caption = (
         "At first order: the gain in log likelihood expected of each effect, the size it would have from its neutral value, "
-        "the share of its signal that the baseline's own parameters cannot absorb, and the smallest size that this experiment "
-        "could have seen (in um, s and N, or MPa)."
+        "the share of its signal that the baseline's own parameters cannot absorb (tolerance), and the smallest size that this "
+        "experiment could have seen (in um, s and N, or MPa)."
     )
-    heads = ["effect", "gain", "expected size", "survives", "could be seen from"]
+    heads = ["effect", "gain", "expected size", "tolerance", "could be seen from"]
     return tag("div", tag("h3", "What each effect could explain"), table(heads, rows, caption=caption, numeric=(1, 2, 3, 4)))
 
 
