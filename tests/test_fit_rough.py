@@ -142,7 +142,7 @@ def test_each_parameter_may_vary_with_something_of_its_own(offset):
     assert names == {*(f"mu0[up{k}]" for k in range(3)), "A", "D0[3 N]", "D0[4 N]"}
     held = next(row for row in result.table.meta["runs"] if row["role"] == "held out")
     assert 0.8 < held["rms_over_noise"] < 1.2
-    with pytest.raises(srf.SrfError, match="'lode' is not one of its values"):
+    with pytest.raises(srf.SrfError, match="D0 cannot vary by 'lode'"):
         srf.fit(srf.read_experiment(offset), free=["mu0", "D0"], vary="D0:lode")
 
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from srfcli.core.errors import SrfError, check_choice
+from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.data.values import Experiment, Run
 
 BY = ("run", "load", "segment", "direction")
@@ -31,8 +31,9 @@ def grouped(experiment: Experiment, vary: Sequence[str] = (), by: str | None = N
     drift, usual = None if trend == "none" else trend or experiment.trend, by or experiment.by
     own = {name: by or way for name, way in experiment.vary.items()}
     own = {name: way or usual for name, _, way in (entry.partition(":") for entry in vary)} or own
-    for way in own.values():
-        check_choice("by", way, BY)
+    for name, way in own.items():
+        if way not in BY:
+            raise SrfError(f"`vary`: {name} cannot vary by '{way}'", did_you_mean(way, BY))
     chosen = replace(experiment, vary=own, by=usual, trend=drift)
     strokes = any(run.backward for run in experiment.runs)
     cut, before = ({way for way in (*e.vary.values(), e.by) if way in CUT} for e in (chosen, experiment))
