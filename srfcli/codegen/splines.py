@@ -43,7 +43,7 @@ class Spline:
 
     @property
     def nodes(self) -> Array:
-        """Return where each number's own bump is centred (n,)."""
+        """Return the centre of each coefficient's basis function (n,)."""
         return np.asarray(self.first + self.spacing * (np.arange(self.coefficients.size) - 1.0))
 
     def weights(self, x: Array) -> tuple[NDArray[np.int64], Array]:
@@ -70,12 +70,12 @@ class Spline:
 
 def appended(p: Array, tables: Sequence[Spline]) -> Array:
     """Return p (n_parameters,) followed by the tables."""
-    place, heads, numbers = p.size + 4 * len(tables), [], []
+    place, heads, found = p.size + 4 * len(tables), [], []
     for table in tables:
         heads.append([place, table.first, table.spacing, table.coefficients.size])
-        numbers.append(table.coefficients)
+        found.append(table.coefficients)
         place += table.coefficients.size
-    return np.concatenate([p, np.ravel(heads), *numbers]) if tables else p
+    return np.concatenate([p, np.ravel(heads), *found]) if tables else p
 
 
 def tables_after(n: int) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:

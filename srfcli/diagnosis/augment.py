@@ -55,8 +55,8 @@ class Augmented:
 
     def options(self, folder: Path | str) -> str:
         """Return the options by which `srf linear` and its like take the model, its files in `folder`, quoted for a shell."""
-        laws = [(flag, file) for flag, file in LAW_OPTIONS if file in self.files]
-        return shlex.join([*(x for flag, file in laws for x in (flag, (Path(folder) / file).as_posix())), *self.system])
+        laws = [x for flag, file in LAW_OPTIONS for x in (flag, (Path(folder) / file).as_posix())]
+        return shlex.join([*laws, *self.system])
 
 
 def augment(

@@ -819,8 +819,8 @@ class ModelSearch:
             return None
         self.count += 1
         expected = found.expected - node.fit.log_likelihood + node.attainable + len(hypothesis.effects) * self._one_more
-        plain_noise = node.fit.likelihood.processes and not likelihood.processes  # its noise is to be estimated anew
-        values = {n: v for n, v in found.point.values.items() if not (plain_noise and n.startswith("gauge_"))}
+        noise_anew = node.fit.likelihood.processes and not likelihood.processes
+        values = {n: v for n, v in found.point.values.items() if not (noise_anew and n.startswith("gauge_"))}
         return _Move(-expected, self.count, hypothesis, values, _sizes_of(hypothesis, likelihood.problem.model, values))
 
     def _in_all_runs(self, best: Fitted) -> None:

@@ -207,12 +207,7 @@ def fit_problem(
         raise SrfError(f"every {what} is held out", "set holdout = false for those that are to be fitted")
     if not names:
         raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
-    _check_varying(experiment, runs, names)
-    groups = {}
-    for n, by in experiment.vary.items():
-        label = labels(experiment, by)
-        if n != GAUGE_NOISE:
-            groups[n] = list(dict.fromkeys(f"{n}[{label[run.name]}]" for run in runs))
+    groups = {n: [f"{n}[{group}]" for group in own] for n, own in _varying(experiment, runs, names).items() if n != GAUGE_NOISE}
     rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names for _ in groups.get(n, [n])]
     names = [own for n in names for own in groups.get(n, [n])]
     for run in runs:
@@ -227,14 +222,20 @@ def fit_problem(
     return Problem(model, experiment, runs, tuple(names), start, lower, upper, trend, tables=tables, stability=stability)
 
 
-def _check_varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[str]) -> None:
-    """Raise SrfError where what is to vary is not free, or the runs fitted are of one group."""
+def _varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[str]) -> dict[str, list[str]]:
+    """Return the groups of the runs fitted, for each name that varies.
+
+    Raises SrfError where what is to vary is not free, or the runs fitted are of one group.
+    """
+    found = {}
     for name, by in experiment.vary.items():
         if name not in (*names, GAUGE_NOISE):
             raise SrfError(f"'{name}' is to vary, and is not free", did_you_mean(name, [*names, GAUGE_NOISE]))
         label = labels(experiment, by)
-        if len({label[run.name] for run in runs}) < 2:
+        found[name] = list(dict.fromkeys(label[run.name] for run in runs))
+        if len(found[name]) < 2:
             raise SrfError(f"{name} cannot vary by {by}: the runs fitted have only one", "Leave `vary` out.")
+    return found
 
 
 @dataclass(frozen=True)
