@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import shutil
 from pathlib import Path
@@ -98,6 +99,21 @@ def test_of_what_varies_a_row_has_the_mean_and_says_so() -> None:
     assert abs(B - TRUE["B"]) < 4 * float(row["B_stderr"]) < 0.4 * TRUE["B"]
     assert float(row["A_minus_B"]) == pytest.approx(A - B) and row["A_minus_B_stderr"] == ""
     assert "B is the mean of 2 groups" in row["flags"]
+
+
+def test_a_load_that_nobody_knows_is_not_stated() -> None:
+    table = experiment("one", seed=1) / "a.csv"
+    rows = [line.split(",") for line in table.read_text().splitlines()[1:]]
+    body = [f"{t},{V},{float(tau) / LOAD:.8g}" for t, V, tau, _ in rows]
+    table.write_text("\n".join(["time [s],load_point_velocity,friction", *body]) + "\n")
+    srf("new", "one/a.csv", "--stiffness", f"{K} 1/um", "--out", "one/experiment.toml", "--force")
+    checked = next(csv.DictReader(io.StringIO(srf("check", "one", "--no-simulate", "--csv").stdout)))
+    assert {checked[name] for name in ("W_mean", "W_min", "W_max")} == {""}
+    drawn = srfcli.check("one", simulate=False).plot()
+    srf("fit", "one", "--table", "out.csv", "--track", "smooth")
+    row = rows_of(Path("out.csv"))["one"]
+    assert (row["load"], row["load_unit"], row["k_unit"], len(drawn.axes)) == ("", "", "1/um", 2)
+    assert float(row["k"]) == pytest.approx(K) and abs(float(row["B"]) - TRUE["B"]) < 4 * float(row["B_stderr"])
 
 
 def _is(text: str) -> bool:

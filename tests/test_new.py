@@ -405,7 +405,7 @@ def test_bounds_of_the_slip_length_are_the_recording_s(V: float, law: str) -> No
         (["run1.csv", "--stiffness", "1 1/um", "--holdout", "run7"], "no such run", "Did you mean 'run1'?"),
         (["still.csv", "--stiffness", "1 1/um"], "which column is the load point's velocity", "--drive VELOCITY"),
         (["still.csv", "--stiffness", "1 1/um"], "velocity or displacement? It has", "--column load_point_displacement=HEADING"),
-        (["dated.csv", "--stiffness", "1 1/um", "--drive", "1"], "'2024-01-01 00:00:01'", "the seconds since the start"),
+        (["dated.csv", "--stiffness", "1 1/um", "--drive", "1"], "'01/02/2024 00:00:01'", "the seconds since the start"),
         (["twice.csv", "--stiffness", "1 1/um", "--drive", "1", "--load", "5 N"], "2 columns are called", "rename one"),
         (["lift.csv", "--stiffness", "1 1/um"], "the load is -1 MPa", "--window FROM,TO"),
     ],
@@ -416,7 +416,7 @@ def test_what_is_missing_or_wrong_is_said_in_a_line_and_nothing_is_written(argum
     table(["t", "mu"], [t, t], "still.csv")
     table(["a", "b"], [t, t], "bare.csv")
     table(["t", "force [N]", "force [N]"], [t, t, t], "twice.csv")
-    dated = [f"2024-01-01 00:00:{i:02d},0.6" for i in range(1, 50)]
+    dated = [f"01/02/2024 00:00:{i:02d},0.6" for i in range(1, 50)]
     Path("dated.csv").write_text("\n".join(["timestamp,mu", *dated]), encoding="utf-8")
     table(["t", "v", "mu", "sigma_MPa"], [t, 1 + t, t, t - 1], "lift.csv")
     done = srf("new", *arguments, code=2)

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
@@ -207,6 +208,45 @@ def test_a_gap_in_an_exported_column_is_told_by_its_line(tmp_path: Path) -> None
         columns(open_source(tmp_path / "a.txt", registry=REGISTRY))
 
 
+STAMPS = {  # heading and how a date and time is written
+    "ISO 8601": ("time", lambda s: s.isoformat(timespec="milliseconds")),
+    "a blank, a zone": ("Time [hh:mm:ss]", lambda s: s.isoformat(" ", timespec="milliseconds") + "+05:30"),
+    "another zone after an hour": ("time", lambda s: zoned(s, timedelta(hours=s.hour == 0))),
+    "times of day": ("time (s)", lambda s: s.strftime("%H:%M:%S.%f")),
+    "slashes, Greenwich": ("Time", lambda s: s.strftime("%Y/%m/%d %H:%M:%S.%fZ")),
+}
+
+
+def zoned(moment: datetime, zone: timedelta) -> str:
+    return (moment + zone).replace(tzinfo=timezone(zone)).isoformat(timespec="milliseconds")
+
+
+@pytest.mark.parametrize("name", STAMPS)
+@pytest.mark.parametrize(
+    ("file", "row", "decimal"),
+    [("a.csv", "{},{}\n", "."), ("a.csv", "{};{}\n", ","), ("a.tsv", '"{}"\t{}\n', "."), ("a.txt", "Rig 5\n\n{};{}\n", ",")],
+)
+def test_time_stamps_are_seconds_since_the_first(name: str, file: str, row: str, decimal: str, tmp_path: Path) -> None:
+    heading, written = STAMPS[name]
+    begin, t = datetime(2024, 2, 28, 23, 59, 50, 250000), np.arange(400) * 0.125
+    head, _, line = row.rpartition("\n\n")
+    stamps = [written(begin + timedelta(seconds=s)) for s in t.tolist()]
+    rows = [line.format(stamp, k / 2).replace(".", decimal) for k, stamp in enumerate(stamps)]
+    (tmp_path / file).write_text(head + "\n" * bool(head) + line.format(heading, "force") + "".join(rows), encoding="utf-8")
+    source = open_source(tmp_path / file, registry=REGISTRY)
+    assert split_heading(source.headings[0])[1] == "s" and source.headings[1] == "force"
+    assert np.abs(columns(source)[0] - t).max() < 1e-9
+    assert np.array_equal(columns(source)[1], np.arange(400) / 2)
+
+
+@pytest.mark.parametrize("stamp", ["2024-02-30T00:00:01", "25:00:00", "00:61:00", "1/2/2024 00:00:01"])
+def test_a_time_that_no_clock_shows_is_told(stamp: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"time,force\n2024-02-28T00:00:00,1\n{stamp},2\n", encoding="utf-8")
+    with pytest.raises(SrfError, match=rf"line 3, column 'time': found '{stamp}', expected a number") as caught:
+        columns(open_source(tmp_path / "a.csv", registry=REGISTRY))
+    assert "2026-11-29T09:15:03.25" in str(caught.value.hint)
+
+
 def test_structure_of_hdf5_and_tdms(tmp_path: Path) -> None:
     """Units in attributes, matrices, tables of named fields, groups with like names, and a clock of sample intervals."""
     h5py, nptdms, t = pytest.importorskip("h5py"), pytest.importorskip("nptdms"), np.arange(40.0)
@@ -216,10 +256,13 @@ def test_structure_of_hdf5_and_tdms(tmp_path: Path) -> None:
         file["one/x"], file["two/x"] = 2 * t, 3 * t
         file["one/x"].attrs["unit"] = np.bytes_("mm")
         file["data"], file["k"], file["name"] = np.stack([t, 4 * t], axis=1), 5.0, "till"
+        file["shear"] = np.stack([7 * t, 8 * t], axis=1)
+        file["shear"].attrs["columns"], file["shear"].attrs["units"] = ["tau", "gap"], "MPa, um"
         file["table"] = np.rec.fromarrays([5 * t, 6 * t], names="force,load")
     source = open_source(tmp_path / "a.h5", registry=REGISTRY)
     found = dict(zip(source.headings, columns(source), strict=True))
-    assert set(found) == {"time [s]", "one/x [mm]", "two/x", "data_1", "data_2", "force", "load"}
+    assert set(found) == {"time [s]", "one/x [mm]", "two/x", "data_1", "data_2", "force", "load", "tau [MPa]", "gap [um]"}
+    assert np.array_equal(found["tau [MPa]"], 7 * t) and np.array_equal(found["gap [um]"], 8 * t)
     assert np.array_equal(found["one/x [mm]"], 2 * t) and np.array_equal(found["data_2"], 4 * t)
     assert np.array_equal(found["load"], 6 * t)
     with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:

@@ -2,14 +2,16 @@
 
 import csv as cells_of
 import io
+import math
 import re
 from collections.abc import Iterator, Sequence
+from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from srfcli.core.units import find_unit
+from srfcli.core.units import find_unit, split_heading
 from srfcli.laws.api import Source, SrfError, reader
 
 BLOCK = 4 * 2**20  # bytes that are parsed at a time
@@ -17,7 +19,10 @@ LONGEST = 2**20  # bytes of a line
 SAMPLE = 2**16  # bytes by which the number of lines is estimated
 SNIFFED = 4096  # bytes from which a reader is chosen
 NOTHING = {"", "nan", "na", "n/a", "null", "none", "-nan", "#n/a"}
-CLOCK = re.compile(r"\d:\d\d|\d{4}[-/.]\d{1,2}[-/.]\d")
+CLOCK = re.compile(r"\d:\d\d|\d{4}[-/.]\d{1,2}[-/.]\d|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}")
+DATE = r"(\d{4})[-/](\d\d)[-/](\d\d)"
+STAMP = re.compile(rf"(?:{DATE}[T ])?(\d\d?):(\d\d):(\d\d(?:\.\d*)?) ?(Z|[+-]\d\d:?(?:\d\d)?)?")  # date, time of day, zone
+DAY = 86400.0  # s
 NUMBER = re.compile(r"[+-]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eEdD][+-]?\d++)?")  # possessive: in the time that the cell is long
 INFINITE = re.compile(r"[+-]?inf(?:inity)?", re.IGNORECASE)
 
@@ -65,7 +70,7 @@ def export(path: Path) -> Source:
             "Name another reader with format = ...; `srf laws --kind reader` lists them.",
         )
     table = _Table(path, layout.headings, layout.delimiter, layout.line - 1, layout.offset, decimal=layout.decimal)
-    return Source(layout.headings, table.blocks, about=_about(path, layout.offset))
+    return Source(table.stamped(), table.blocks, about=_about(path, layout.offset))
 
 
 class _Layout(NamedTuple):
@@ -88,7 +93,7 @@ def _layout(head: bytes) -> _Layout | None:
     raw = text.replace(b"\r\n", b"\n ").replace(b"\r", b"\n").split(b"\n")  # a blank for the byte that was there
     if len(head) == SNIFFED or len(head) == SAMPLE:
         raw = raw[:-1]  # it may be cut
-    lines = [_decoded(line).strip() for line in raw]
+    lines = [text.strip(" \r\n") if text.strip() else "" for text in map(_decoded, raw)]  # a tab may be an empty cell
     begin = next((k for k, line in enumerate(lines) if _table_begins(lines, k)), None)
     if begin is None:
         return None
@@ -170,7 +175,8 @@ def _cells(line: str, delimiter: str, count: int = 0) -> list[str]:
 
 
 def _is_number(cell: str, decimal: str) -> bool:
-    return bool(NUMBER.fullmatch(cell.replace(decimal, ".", 1))) or cell.lower() in NOTHING - {""}
+    text = cell.replace(decimal, ".", 1)
+    return bool(NUMBER.fullmatch(text) or STAMP.fullmatch(text) or re.fullmatch(DATE, cell)) or cell.lower() in NOTHING - {""}
 
 
 def _is_row(cells: Sequence[str], count: int, decimal: str) -> bool:
@@ -197,13 +203,13 @@ def _open(path: Path, delimiters: str) -> Source:
     headings = tuple(cell.strip() for cell in next(cells_of.reader([line], delimiter=delimiter, skipinitialspace=True)))
     if headings and not headings[-1]:
         headings = headings[:-1]  # a delimiter at the end of each line
-    if all(NUMBER.fullmatch(cell) for cell in headings):
+    if all(NUMBER.fullmatch(cell) or STAMP.fullmatch(cell) for cell in headings):
         raise SrfError(
             f"{path}, line {number}: found numbers, expected a line of headings",
             "Begin the file with one, as in: time [s],normal_load [N],elongation [um]",
         )
     table = _Table(path, headings, delimiter, number, offset)
-    return Source(headings, table.blocks, about=_about(path, offset))
+    return Source(table.stamped(), table.blocks, about=_about(path, offset))
 
 
 def _about(path: Path, offset: int) -> int | None:
@@ -237,7 +243,7 @@ def _heading(path: Path) -> tuple[str, int, int]:
             elif text:
                 cells = [cell.strip() for cell in re.split(r"[,;\t]", text)]
                 bare = comment.lstrip("#% ")
-                if comment and all(NUMBER.fullmatch(c) or c.lower() in NOTHING for c in cells) and bare:
+                if comment and all(_is_number(c, ".") or not c for c in cells) and bare:
                     return bare, number - 1, at
                 length = len(line) + (3 if number == 1 and raw.startswith(b"\xef\xbb\xbf") else 0)
                 return _decoded(line).strip(" \r\n"), number, at + length
@@ -262,6 +268,33 @@ def _decoded(line: bytes) -> str:
         return line.decode("latin-1")  # where the micro sign is one byte
 
 
+class _Clock:
+    """Time stamps of a column as seconds since the first one; times of day without a date go on past midnight."""
+
+    def __init__(self) -> None:
+        self.first: tuple[int, float] | None = None
+        self.midnights, self.last = 0, -math.inf
+
+    def read(self, stamp: re.Match[str]) -> float | None:
+        """Return the seconds since the first stamp, None where a clock does not show such a time."""
+        year, month, day, hours, minutes, seconds, zone = stamp.groups()
+        of_day = 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+        if int(hours) > 24 or int(minutes) > 59 or float(seconds) >= 61:
+            return None
+        if year:
+            try:
+                days = date(int(year), int(month), int(day)).toordinal()
+            except ValueError:
+                return None
+            if zone and zone != "Z":
+                of_day -= math.copysign(3600 * int(zone[1:3]) + 60 * int(zone[3:].lstrip(":") or 0), float(zone[0] + "1"))
+        else:
+            self.midnights += of_day < self.last - DAY / 2
+            days, self.last = self.midnights, of_day
+        self.first = self.first or (days, of_day)
+        return (days - self.first[0]) * DAY + (of_day - self.first[1])
+
+
 class _Table:
     """The numbers below the headings, read block by block at the speed of C where every cell is a number."""
 
@@ -271,9 +304,21 @@ class _Table:
         self.path, self.headings, self.delimiter, self.line, self.offset = path, headings, delimiter, line, offset
         self.decimal = decimal
 
+    def stamped(self) -> tuple[str, ...]:
+        """Return the headings, with the unit s where the first row has a time stamp."""
+        with self.path.open("rb") as stream:
+            stream.seek(self.offset)
+            lines = (raw.partition(b"\r")[0].decode("latin-1").strip() for raw in iter(lambda: stream.readline(LONGEST), b""))
+            first = next((text for text in lines if text and not text.startswith(("#", "%"))), "")
+        cells = [cell.strip() for cell in (first.split() if self.delimiter == " " else first.split(self.delimiter))]
+        if len(cells) < len(self.headings):
+            return self.headings
+        stamps = [STAMP.fullmatch(cell.strip('"').replace(self.decimal, ".")) for cell in cells]
+        return tuple(f"{split_heading(h)[0]} [s]" if stamp else h for h, stamp in zip(self.headings, stamps, strict=False))
+
     def blocks(self, columns: tuple[int, ...]) -> Iterator[Sequence[np.ndarray]]:
         """Yield the columns in blocks of rows."""
-        line = self.line + 1
+        line, clocks = self.line + 1, [_Clock() for _ in columns]
         with self.path.open("rb") as stream:
             stream.seek(self.offset)
             rest = b""
@@ -289,7 +334,7 @@ class _Table:
                 if block.strip():
                     block = block.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
                     table = self._fast(block, columns)
-                    yield self._slow(block, columns, line) if table is None else table
+                    yield self._slow(block, columns, line, clocks) if table is None else table
                     line += block.count(b"\n")
                 elif block:
                     line += max(block.count(b"\n"), block.count(b"\r"))
@@ -328,17 +373,17 @@ class _Table:
             return None
         return [np.ascontiguousarray(table[:, k]) for k in columns]
 
-    def _slow(self, block: bytes, columns: tuple[int, ...], first: int) -> Sequence[np.ndarray]:
+    def _slow(self, block: bytes, columns: tuple[int, ...], first: int, clocks: Sequence[_Clock]) -> Sequence[np.ndarray]:
         """Return the columns of a block cell by cell: empty ones are NaN, bad ones raise SrfError with line and column."""
         rows = []
         for number, text in enumerate(block.decode("latin-1").split("\n"), start=first):
             if not text.strip() or text.lstrip().startswith(("#", "%")):
                 continue
-            rows.append(self._row(text, columns, number))
+            rows.append(self._row(text, columns, number, clocks))
         table = np.array(rows, dtype=float).reshape(-1, len(columns))
         return [np.ascontiguousarray(table[:, k]) for k in range(len(columns))]
 
-    def _row(self, text: str, columns: tuple[int, ...], number: int) -> list[float]:
+    def _row(self, text: str, columns: tuple[int, ...], number: int, clocks: Sequence[_Clock]) -> list[float]:
         _check(self.path, text.encode("latin-1"), number)
         try:
             cells = text.split() if self.delimiter == " " else self._split(text)
@@ -352,17 +397,19 @@ class _Table:
             else:
                 hint = f"The columns are: {', '.join(self.headings)}"
             raise SrfError(f"{self.path}, line {number}: found {len(cells)} cells, expected {len(self.headings)}", hint)
-        return [self._number(cells[k].strip(), k, number) for k in columns]
+        return [self._number(cells[k].strip(), k, number, clock) for k, clock in zip(columns, clocks, strict=True)]
 
     def _split(self, text: str) -> list[str]:
         return next(cells_of.reader([text], delimiter=self.delimiter, skipinitialspace=True, strict=True))
 
-    def _number(self, cell: str, column: int, line: int) -> float:
+    def _number(self, cell: str, column: int, line: int, clock: _Clock) -> float:
         cell = cell.replace(",", ".", 1) if self.decimal == "," else cell
         if NUMBER.fullmatch(cell):
             return float(cell.replace("d", "e").replace("D", "e"))
         if cell.lower() in NOTHING or INFINITE.fullmatch(cell):
             return float("nan")
+        if (stamp := STAMP.fullmatch(cell)) and (seconds := clock.read(stamp)) is not None:
+            return seconds
         where = f"{self.path}, line {line}, column '{self.headings[column]}'"
         if NUMBER.fullmatch(cell.replace(",", ".", 1)):
             raise SrfError(
@@ -371,5 +418,5 @@ class _Table:
         short = cell if len(cell) <= 40 else cell[:37] + "..."
         hint = "Leave a missing value empty, or write nan."
         if CLOCK.search(cell):
-            hint = "Dates and times of day are not read: write the seconds since the start."
+            hint = "Time stamps are read as 2026-11-29T09:15:03.25 or 09:15:03.25; or write the seconds since the start."
         raise SrfError(f"{where}: found {short!r}, expected a number", hint)

@@ -12,7 +12,8 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 BEHIND_MATLAB = 512  # bytes of text before it in a MATLAB file
 ROWS = 2**18  # read at a time
 MOST = 10_000  # datasets of a file, and columns of one
-UNITS = ("units", "unit", "Units", "Unit")  # attributes that state one
+UNITS = ("units", "unit", "Units", "Unit")  # attributes that state them
+HEADINGS = ("columns", "column_names", "Columns", "names")  # attributes that head a matrix's columns
 TEXT = ("char", "string", "cell", "function_handle", "logical")  # MATLAB classes that are no numbers
 WHOLE = "Was the file copied to its end?"
 
@@ -23,7 +24,7 @@ def _is_hdf5(head: bytes) -> bool:
 
 @reader(name="hdf5", suffixes=(".h5", ".hdf5", ".hdf", ".nc"), sniff=_is_hdf5)
 def hdf5(path: Path) -> Source:
-    """HDF5 and MATLAB 7.3, a dataset for each column, or a matrix's as data_1, data_2, ...; units in attributes or [columns]"""
+    """HDF5 and MATLAB 7.3, a dataset for each column, or those of a matrix; units in attributes or [columns]"""
     h5py = _library(path)
     with path.open("rb") as stream:
         matlab = stream.read(11).startswith(b"MATLAB 7.3")
@@ -72,7 +73,8 @@ def _columns(h5py: Any, file: Any, path: Path, matlab: bool) -> dict[str, tuple[
     def visit(name: str, item: Any) -> bool | None:
         if not isinstance(item, h5py.Dataset) or name.startswith("#"):
             return None
-        unit = next((_text(item.attrs[key]) for key in UNITS if key in item.attrs), "")
+        units = _attribute(item, UNITS)
+        unit = units[0] if units else ""
         short = name.rpartition("/")[2]
         if item.dtype.names and item.ndim == 1:
             kinds = {field: item.dtype[field].kind for field in item.dtype.names}
@@ -85,7 +87,10 @@ def _columns(h5py: Any, file: Any, path: Path, matlab: bool) -> dict[str, tuple[
             elif len(long) == 2 == item.ndim:
                 axis = 1 if matlab else 0  # MATLAB's matrices are stored column by column
                 count = min(item.shape[1 - axis], MOST)
-                places.extend((f"{short}_{k + 1}", name, (axis, k), item.shape[axis], unit) for k in range(count))
+                heads = _attribute(item, HEADINGS)
+                heads = heads if len(heads) == count else [f"{short}_{k + 1}" for k in range(count)]
+                own = units if len(units) == count else [unit] * count
+                places.extend((heads[k], name, (axis, k), item.shape[axis], own[k]) for k in range(count))
         return True if len(places) > MOST else None
 
     try:
@@ -99,6 +104,14 @@ def _columns(h5py: Any, file: Any, path: Path, matlab: bool) -> dict[str, tuple[
         alone = short if names.count(short) == 1 else f"{name}/{short}" if own else name
         found[f"{alone} [{unit}]" if unit and "[" not in alone else alone] = (name, part, length)
     return found
+
+
+def _attribute(item: Any, keys: Sequence[str]) -> list[str]:
+    """Return the texts of the first of these attributes that a dataset has: one, one for each column, or between commas."""
+    value = next((item.attrs[key] for key in keys if key in item.attrs), "")
+    if isinstance(value, np.ndarray) and value.ndim:
+        return [_text(part) for part in value.ravel()]
+    return [part.strip() for part in _text(value).split(",")]
 
 
 def _text(value: Any) -> str:

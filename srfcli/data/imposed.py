@@ -21,7 +21,7 @@ from srfcli.data.description import RunDescription
 from srfcli.data.noise import NOISE_SAMPLES, deviations, quantisation, saturation, spikes, white_level
 from srfcli.data.values import OBSERVABLES, Declared
 from srfcli.laws.registry import Registry
-from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation, SampledLoad
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation, SampledLoad, UnknownLoad
 
 # The driving velocity of a run: from its description, from a column of velocities, or from one of displacements.
 
@@ -711,10 +711,9 @@ def load_of(run: RunDescription, columns: Columns, unit: str) -> tuple[Load, lis
     """Return the load in a run's column, else the one that it states, and what is to be told of it in N or MPa."""
     role = columns.role(*LOADS)
     if role is None:
-        W0 = 1.0 if run.load is None else run.load
-        if run.modulation is None:
-            return ConstantLoad(W0), []
-        return declared_load(W0, run.modulation), []
+        if run.modulation is not None:
+            return declared_load(1.0 if run.load is None else run.load, run.modulation), []
+        return UnknownLoad() if run.load is None else ConstantLoad(run.load), []
     place, values = columns.place(role), columns.arrays[role]
     load, notices = load_from_column(place, values, unit)
     first = load.rest(float(place.t[0]))

@@ -15,7 +15,7 @@ from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.units import factor_between, find_unit, split_quantity, to_base
 from srfcli.data.clock import Sampling, find_sampling
 from srfcli.data.thresholds import Thresholds
-from srfcli.motion.imposed import Drive, Load
+from srfcli.motion.imposed import Drive, Load, UnknownLoad
 
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
 OTHER_OBSERVABLES = {"slip": "um", "contact_area": "1"}  # what may be observed besides one of these
@@ -157,6 +157,11 @@ class Run:
     def friction(self) -> Array:
         """Return the friction coefficient of each reading (n,), by the stated stiffness."""
         return np.asarray(self.observed * self.friction_factor(self.load(self.t)[0]))
+
+    @property
+    def load_known(self) -> bool:
+        """Return whether the load was recorded or stated, not friction alone."""
+        return not isinstance(self.load, UnknownLoad)
 
     @property
     def load_unit(self) -> str:

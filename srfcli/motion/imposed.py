@@ -100,6 +100,13 @@ class ConstantLoad(Load):
         return np.full(np.size(t), self.W0), np.zeros(np.size(t))
 
 
+class UnknownLoad(ConstantLoad):
+    """The load of a run of which friction alone is known: a constant of 1 N, by which no result depends on it."""
+
+    def __init__(self) -> None:
+        super().__init__(1.0)
+
+
 @dataclass(frozen=True)
 class Modulation(Load):
     """W = W0 (1 + eps s(t) cos(2 pi f t + phase)), where s rises smoothly from 0 to 1 over `rise` seconds from `onset` on.

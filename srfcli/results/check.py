@@ -164,12 +164,12 @@ def row(check: RunCheck, told: CramerRaoBound | None) -> tuple[Any, ...]:
         "noise": check.noise.total, "white_noise": check.noise.white,
         "colour": "; ".join(map(colour_text, check.noise.colours)), "quantum": run.quantum,
         "V_min": check.slowest, "V_max": check.fastest,
-        "W_mean": load.mean, "W_min": load.lowest, "W_max": load.highest, "W_rate": load.rate,
+        **({"W_mean": load.mean, "W_min": load.lowest, "W_max": load.highest} if run.load_known else {}), "W_rate": load.rate,
         "f": found.frequency if found else None, "eps": found.amplitude if found else None,
         "onset": found.onset if found and math.isfinite(found.onset) else None,
         **{f"{name}_{key}": found_out.get(key, {}).get(name) for name in CHANGE_HEADINGS for key in ("error", "peak")},
     }  # fmt: skip
-    return tuple(cells[column.name] for column in COLUMNS)
+    return tuple(cells.get(column.name) for column in COLUMNS)
 
 
 def _noise_table(checks: Sequence[RunCheck]) -> Table:
@@ -258,7 +258,7 @@ def described(check: RunCheck, told: CramerRaoBound | None) -> dict[str, Any]:
         "noise": [{"interval": dt, **_noise(noise)} for dt, noise in zip(check.sampling.spacings, check.noises, strict=True)],
         "friction_noise": check.friction_noise,
         "drive": [{"from": a, "velocity": v, "acceleration": s} for a, v, s in check.drive],
-        "load": {"mean": load.mean, "low": load.lowest, "high": load.highest, "rate": load.rate},
+        "load": {"mean": load.mean, "low": load.lowest, "high": load.highest, "rate": load.rate} if run.load_known else None,
         "modulation": load.modulation and dataclasses.asdict(load.modulation),
         "declared_modulation": run.modulation,
         "tells": told and tells(told),

@@ -62,7 +62,7 @@ UNUSED = "#D55E00"
 
 
 def recordings(checks: Sequence[RunCheck], *, title: str = "") -> Figure:
-    """Return a panel for each run: observable, driving velocity and load over time.
+    """Return a panel for each run: observable, driving velocity and, where it is known, load over time.
 
     Samples that are not used are marked, gaps are shaded, proposed corrections drawn.
     """
@@ -72,7 +72,7 @@ def recordings(checks: Sequence[RunCheck], *, title: str = "") -> Figure:
         figure = plots.bare_figure((6.4 * columns, 3.3 * rows + 0.4))
         outer = figure.add_gridspec(rows, columns)
         for k, check in enumerate(checks):
-            axes = stacked(figure, outer[k // columns, k % columns], (3, 1, 1), hspace=0.06)
+            axes = stacked(figure, outer[k // columns, k % columns], (3, 1, 1) if check.run.load_known else (3, 1), hspace=0.06)
             _panel(axes, check)
             figure.align_ylabels(axes)
         if title:
@@ -109,7 +109,7 @@ def _panel(axes: list[Axes], check: RunCheck) -> None:
     V, W = run.drive(t), run.load(t)[0]
     quantity = run.quantity + (f"\n[{unit_text(run.unit)}]" if run.unit != "1" else "")
     panels = ((run.observed, "u", quantity), (V, "v", "V\n[µm/s]"), (W, "W", f"W\n[{run.load_unit}]"))
-    for axis, (values, key, label) in zip(axes, panels, strict=True):
+    for axis, (values, key, label) in zip(axes, panels, strict=False):
         axis.plot(*envelope(t, values), color=plots.QUANTITY[key], linewidth=0.8)
         axis.set_ylabel(label)
         axis.margins(x=0.01, y=0.08)
@@ -120,11 +120,12 @@ def _panel(axes: list[Axes], check: RunCheck) -> None:
     for axis in axes:
         axis.ticklabel_format(axis="y", useOffset=False)
     imposed_scale(axes[1], V, wide=True)
-    imposed_scale(axes[2], W, wide=False)
+    if run.load_known:
+        imposed_scale(axes[2], W, wide=False)
     marked = _mark_unused(axes[0], t, run.observed, ~run.used)
     axes[0].set_title(f"{plots.name_text(run.name)}{' (held out)' if run.holdout else ''}{marked}")
-    axes[2].set_xlabel("time  [s]")
-    for axis in axes[:2]:
+    axes[-1].set_xlabel("time  [s]")
+    for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)
 
 

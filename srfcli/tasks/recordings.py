@@ -423,7 +423,8 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     row: dict[str, Any] = {
         "experiment": path, "status": found.worst.value, "law": f"{experiment.choice.law}, {experiment.choice.ageing}",
         "runs": len(runs), "samples": sum(int(run.used.sum()) for run in runs),
-        "load": float(np.mean([run.load(run.t)[0].mean() for run in runs])), "load_unit": runs[0].load_unit,
+        "load": float(np.mean([run.load(run.t)[0].mean() for run in runs])) if all(run.load_known for run in runs) else None,
+        "load_unit": runs[0].load_unit if runs[0].load_known else None,
         "parameters": parameters, "rms_over_noise": _number(result.rms_over_noise()),
         "covariances": {name: shared(*pair) for name, pair in PAIRS.items()},
     }  # fmt: skip
