@@ -209,16 +209,22 @@ def test_a_stiffness_per_load_is_never_rescaled_in_silence(step: dict[str, np.nd
     assert "counts for each run" not in srf("check", ".", "--no-simulate").stdout
 
 
-def to_and_fro(*, strokes: int, K: float = 4e-4, W: float = 0.02, D0: float = 4.0, V: float = 5.0) -> np.ndarray:
-    """Return t, x and F (3, n) of a slider on a spring that turns back every 40 s, with the law regularised."""
+def to_and_fro(
+    *, strokes: int, K: float = 4e-4, W: float = 0.02, D0: float = 4.0, V: float = 5.0, play: float = 0.0
+) -> np.ndarray:
+    """Return t, x and F (3, n) of a slider on a spring that turns back every 40 s, with the law regularised.
+
+    The spring is slack while the drive crosses its `play` (um).
+    """
     A, B, mu0, dt, rng = 0.012, 0.008, 0.5, 5e-4, np.random.default_rng(1)
-    F, phi, x, out = 0.0, D0 / V, 0.0, []
+    F, u, phi, x, out = 0.0, 0.0, D0 / V, 0.0, []
     for i in range(int(40 * strokes / dt)):
         s = 1 - 2 * (int(i * dt // 40) % 2)
         if i % 100 == 0:
             out.append((i * dt, x, F + rng.normal(0.0, 4e-6)))
         v = 2 * V * math.exp(-(mu0 + B * math.log(V * phi / D0)) / A) * math.sinh(F / W / A)
-        F, phi, x = F + dt * K * (s * V - v), phi + dt * (1 - abs(v) * phi / D0), x + dt * s * V
+        u, phi, x = u + dt * (s * V - v), phi + dt * (1 - abs(v) * phi / D0), x + dt * s * V
+        F = K * (u - min(max(u, -play), 0.0))
     return np.array(out).T
 
 
@@ -261,8 +267,11 @@ def test_a_stroke_may_have_less_force_than_the_others() -> None:
     assert [r["window"][1] for r in runs] == pytest.approx([10, 20, 30, 40, 50, 60], abs=0.5)
 
 
-def test_the_strokes_of_a_reciprocating_tribometer_are_fitted() -> None:
-    t, x, F = to_and_fro(strokes=2)
+@pytest.mark.parametrize("play", [0.0, 40.0])
+def test_the_strokes_of_a_reciprocating_tribometer_are_fitted(play: float) -> None:
+    """Play of the drive is crossed before a stroke begins, whatever its size."""
+    t, x, F = to_and_fro(strokes=2, play=play)
+    assert (np.abs(F) < 2e-5).sum() == pytest.approx(play / 5.0 / 0.05, abs=5)  # readings of a slack spring
     table(["time [s]", "Position [um]", "Friction [uN]", "Normal [mN]"], [t, x, 1e6 * F, 20 + 0 * t])
     srf("new", "run1.csv", "--stiffness", "400 uN/um")
     rows = {line.split(",")[0]: line.split(",") for line in srf("fit", ".", "--track", "smooth", "--csv").stdout.splitlines()}

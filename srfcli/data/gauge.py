@@ -32,7 +32,7 @@ STRETCHES = (64, 128, 256)  # samples over which a parabola is the trend: the lo
 SLOW = 3  # lowest frequencies of stretches, which those half as long do not resolve
 SPECTRUM_RISE = 1.5  # power at these frequencies over that predicted from shorter stretches, at most; more is signal
 SLOWEST = 2.0  # periods of an oscillation in a stretch, at least
-SLOW_SHARE = 0.9  # of a stretch, the longest correlation time that is told from a signal
+SLOW_SHARE = 0.9  # of the longest time that a stretch bounds: a process beyond it is at its bound, not told from a signal
 COLOUR_SAMPLES = 32  # samples from which coloured noise is estimated
 ENOUGH_STRETCHES = 4  # stretches; if there are more, some may be rejected
 REJECTED_SHARE = 1e-3  # share of stretches of pure noise that are rejected
@@ -171,9 +171,14 @@ def with_slower(noises: Sequence[GaugeNoise]) -> tuple[GaugeNoise, ...]:
     for noise in noises:
         longer = [other for other in noises if other.stretch > noise.stretch]
         seen = max(longer, key=lambda other: other.samples, default=noise)
-        slow = [c for c in seen.colours if noise.stretch < (c[0] / SLOW_SHARE if len(c) == 2 else SLOWEST / c[0])]
+        slow = [c for c in seen.colours if not _resolved(c, noise.stretch)]
         found.append(replace(noise, colours=(*noise.colours, *slow)))
     return tuple(found)
+
+
+def _resolved(colour: tuple[float, ...], stretch: float) -> bool:
+    """Return whether stretches of so many seconds tell a process from a signal that bends."""
+    return (colour[0] if len(colour) == 2 else SLOWEST / colour[0]) <= SLOW_SHARE * stretch
 
 
 # How it is found.
@@ -207,10 +212,7 @@ def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0,
                 break
         found = whittle.noise()
     assert found is not None
-    # a process that is as slow as it may be is not told from a signal
-    longest_time, lowest_frequency = SLOW_SHARE * found.stretch, 1.1 * SLOWEST / found.stretch
-    told = [c for c in found.colours if (c[0] <= longest_time if len(c) == 2 else c[0] >= lowest_frequency)]
-    return replace(found, colours=tuple(told))
+    return replace(found, colours=tuple(c for c in found.colours if _resolved(c, found.stretch)))
 
 
 @dataclass(frozen=True)
