@@ -6,7 +6,8 @@
     srf.linear(slider).plot()
 
 `system`, `load_law` and `read_experiment` prepare the input. Every other function does the work of one command and returns a
-result with `.table`, `.to_dataframe()`, `.to_xarray()` and `.plot()`; `continue_boundary` returns an iterator of such results.
+result with `.table`, `.to_dataframe()`, `.to_xarray()` and, unless it is a text, `.plot()`; `continue_boundary` returns an
+iterator of such results.
 """
 
 from __future__ import annotations
@@ -29,10 +30,14 @@ if TYPE_CHECKING:
     from srfcli.tasks.map import map as map
     from srfcli.tasks.recordings import check as check
     from srfcli.tasks.recordings import fit as fit
+    from srfcli.tasks.recordings import fit_thresholds as fit_thresholds
+    from srfcli.tasks.recordings import new_experiment as new_experiment
     from srfcli.tasks.recordings import read_experiment as read_experiment
     from srfcli.tasks.simulate import simulate as simulate
+    from srfcli.tasks.stability import code as code
     from srfcli.tasks.stability import continue_boundary as continue_boundary
     from srfcli.tasks.stability import critical as critical
+    from srfcli.tasks.stability import derive as derive
     from srfcli.tasks.stability import floquet as floquet
     from srfcli.tasks.stability import linear as linear
     from srfcli.tasks.stability import response as response
@@ -43,8 +48,10 @@ PUBLIC = {
     "SlidingSystem": "srfcli.codegen.slider",
     "SrfError": "srfcli.core.errors",
     "Status": "srfcli.core.errors",
+    "code": "srfcli.tasks.stability",
     "continue_boundary": "srfcli.tasks.stability",
     "critical": "srfcli.tasks.stability",
+    "derive": "srfcli.tasks.stability",
     "floquet": "srfcli.tasks.stability",
     "linear": "srfcli.tasks.stability",
     "response": "srfcli.tasks.stability",
@@ -54,6 +61,8 @@ PUBLIC = {
     "diagnose": "srfcli.tasks.diagnose",
     "check": "srfcli.tasks.recordings",
     "fit": "srfcli.tasks.recordings",
+    "fit_thresholds": "srfcli.tasks.recordings",
+    "new_experiment": "srfcli.tasks.recordings",
     "read_experiment": "srfcli.tasks.recordings",
     "simulate": "srfcli.tasks.simulate",
     "system": "srfcli.codegen.slider",

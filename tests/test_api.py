@@ -17,6 +17,7 @@ from click.testing import CliRunner
 
 import srfcli as srf
 from srfcli.cli.main import cli
+from srfcli.data.thresholds import thresholds
 from srfcli.inference.prediction import run_parameters
 from srfcli.results.tables import plain_value
 
@@ -141,6 +142,69 @@ def test_an_experiment_is_read_checked_and_fitted(tmp_path: Path, monkeypatch: p
         found.plot(ax=figure.add_axes((0, 0, 1, 1)))
 
 
+def test_formulas_and_code_are_those_of_the_commands(slider: srf.SlidingSystem, tmp_path: Path) -> None:
+    def printed(*arguments: str) -> str:
+        done = CliRunner().invoke(cli, [*arguments, "--law", "log-log", "--ageing", "ruina"])
+        assert done.exit_code == 0, done.stderr
+        return done.stdout
+
+    other = srf.system("log-log", ageing="ruina", K=0.3)  # values do not matter
+    found = srf.derive(other, extras="jacobian")
+    assert found.text == printed("derive", "--with", "jacobian")
+    assert found.latex == printed("derive", "--with", "jacobian", "--format", "latex")
+    assert found.python == printed("derive", "--format", "python")
+    whole = srf.derive(other, extras=["jacobian", "parameters"])
+    assert whole.document == json.loads(printed("derive", "--format", "json"))
+    assert f"  mu_ss = {found.formulas['mu_ss']}\n" in found.text and "<p>$C_{0} = " in found._repr_html_()
+    names = [row[1] for row in found.table.rows]
+    assert names == [f.name for section in found.sections for f in section.formulas] and set(names) == set(found.formulas)
+    module = srf.code(other)
+    assert module.text == printed("code") and {"rates", "steady"} <= {row[0] for row in module.table.rows}
+    module.write(tmp_path / "model.py")
+    assert (tmp_path / "model.py").read_text(encoding="utf-8") == module.text
+    for wrong in (lambda: module.write(tmp_path / "model.py"), module.plot):
+        with pytest.raises(srf.SrfError):
+            wrong()
+
+
+def test_an_experiment_is_drafted_as_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    rows = [f"{0.1 * k:.1f},{60 + k % 3}" for k in range(200)]
+    Path("run.csv").write_text("\n".join(["clock,S [kPa]", *rows]), encoding="utf-8")
+    columns = {"time": "clock [s]", "shear_stress": "S"}
+    said = {"stiffness": "55 MPa/mm", "load": "100 kPa", "title": "steps", "radius": "25 mm"}
+    options = [part for name, text in said.items() for part in (f"--{name}", text)]
+    options += [part for role, heading in columns.items() for part in ("--column", f"{role}={heading}")]
+    done = CliRunner().invoke(cli, ["new", "run.csv", *options, "--drive", "10:3, 10:30", "--window", "1,19", "--out", "-"])
+    assert done.exit_code == 0, done.stderr
+    made = srf.new_experiment("run.csv", columns=columns, drive=[(10, 3), (10, 30)], window=(1, 19), **said)
+    assert made.text == done.stdout and all(f"Note: {note}\n" in done.stderr for note in made.notes)
+    assert [row[:3] for row in made.table.rows] == [("time", "clock", "s"), ("shear_stress", "S [kPa]", "kPa")]
+    made.write()
+    assert srf.read_experiment(tmp_path).runs[0].t.size == 181
+    with pytest.raises(srf.SrfError, match="exists already"):
+        made.write()
+    for wrong, text in (
+        ({"stiffness": None}, "the stiffness of the machine is in no table"),
+        ({"stiffness": "55"}, "`stiffness` '55' has no unit"),
+        ({"window": 3}, "no list of pairs"),
+        ({"drive": None}, "which column is the load point's velocity"),
+        ({"columns": {"shears": "S"}}, "no such role"),
+    ):
+        with pytest.raises(srf.SrfError) as found:
+            srf.new_experiment("run.csv", **{"columns": columns, "drive": 3, **said, **wrong})
+        assert text in str(found.value)
+
+
+def test_critical_loads_are_fitted_as_by_the_command(slider: srf.SlidingSystem, tmp_path: Path) -> None:
+    table = tmp_path / "loads.csv"
+    table.write_text("V,eps,W0c,sigma\n1,0,7.4,0.2\n5,0,7.3,0.2\n20,0,8.7,0.2\n60,0,10.6,0.3\n10,0.2,9.4,0.3\n")
+    found = srf.fit_thresholds(table, slider.at(D0="500 nm"), free="D0,rho", rho=0.5, bounds={"D0": ("0.2 um", 1)})
+    options = ("--free", "D0,rho", "--set", "D0=0.5", "--set", "rho=0.5", "--bounds", "D0=0.2:1")
+    assert [plain_value(row) for row in found.table.rows] == rows_of("fit", str(table), *options)
+    assert found.values["D0"] == pytest.approx(0.4, abs=5 * found.stderr["D0"]) and set(found.values) == {"D0", "rho"}
+
+
 def test_comparing_names_what_was_matched() -> None:
     with pytest.raises(srf.SrfError, match="one law"):
         srf.compare({"a": srf.system()})
@@ -224,6 +288,13 @@ WRONG = {
     "a trend": (lambda s: srf.fit("here", trend="up"), "`trend`: 'up'"),
     "a name twice": (lambda s: srf.fit("here", free="A,A"), "named twice"),
     "no start": (lambda s: srf.fit("here", starts=0), "one start or more"),
+    "a part": (lambda s: srf.derive(s, extras="hessian"), "`extras`: 'hessian'"),
+    "an effect's formulas": (lambda s: srf.derive(srf.system(effects="viscous-drag")), "no part in a derivation"),
+    "code of a gauge": (lambda s: srf.code(srf.system(effects="sensor-lag")), "critical loads do not depend on"),
+    "a draft of nothing": (lambda s: srf.new_experiment("here.csv", stiffness="1 N/um"), "here.csv"),
+    "a kind of experiment": (lambda s: srf.new_experiment([], stiffness="1 N/um", kind="slow"), "`kind`: 'slow'"),
+    "no recordings": (lambda s: srf.new_experiment([], stiffness="1 N/um"), "no recordings"),
+    "no table": (lambda s: srf.fit_thresholds("here.csv", s, free="A"), "here.csv"),
     "what varies by what": (lambda s: srf.diagnose("here", by="weekday"), "`by`: 'weekday'"),
 }
 
@@ -233,6 +304,21 @@ def test_a_wrong_argument_is_said_in_a_line(call, message: str, slider: srf.Slid
     with pytest.raises(srf.SrfError) as found:
         call(slider)
     assert message in str(found.value) and "\n" not in str(found.value)
+
+
+def test_what_is_fitted_to_critical_loads_is_said_in_a_line(slider: srf.SlidingSystem) -> None:
+    table = thresholds([1, 10], [0, 0], [7.3, 7.8])
+    for options, said in (
+        ({"free": "nosuch"}, "unknown parameter 'nosuch'"),
+        ({"free": "V"}, "V cannot be fitted"),
+        ({"free": ["A", "B", "D0"]}, "2 critical loads for 3 free parameters"),
+        ({"free": "A", "methods": "newton"}, "unknown method 'newton'"),
+        ({"free": "A", "bounds": {"A": 3}}, "`bounds` of A: 3 is no pair of numbers"),
+        ({"free": "A", "rho": -1}, "below its lower bound"),
+    ):
+        with pytest.raises(srf.SrfError) as found:
+            srf.fit_thresholds(table, slider, **options)
+        assert said in str(found.value)
 
 
 def test_values_may_be_text_with_a_unit(slider: srf.SlidingSystem) -> None:

@@ -29,10 +29,8 @@ from srfcli.cli.options import (
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_target, write_atomic
 from srfcli.core.settings import Parameter
-from srfcli.core.units import to_base
 
 if TYPE_CHECKING:
-    from srfcli.inference.thresholds import Trace
     from srfcli.results.fit import CampaignResult
 
 EXAMPLES = """
@@ -108,10 +106,7 @@ def command(
             )
         meant = ("starts", "trend", "vary", "by", "prior", "track", "sample", "draws", "reader")
         _refuse(meant, "recordings")
-        fit_thresholds(
-            source, system=system, output=output, free=options["free"], bounds=options["bounds"],
-            methods=options["method"], tol=options["tol"], max_evaluations=options["max_evaluations"], profile=options["profile"],
-        )  # fmt: skip
+        _fit_thresholds(source, system, output, **options)
         return
     _refuse(("bounds", "method", "tol", "max_evaluations"), "critical loads")
     for name, setting in system.chosen.items():
@@ -246,67 +241,43 @@ def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> P
     return place
 
 
-# What `srf fit` does with a table of critical loads: both methods side by side, with cost against evaluations.
+# A table of critical loads: both methods side by side, with cost against evaluations.
 
 
-def fit_thresholds(
-    path: Path,
-    *,
-    system: SystemOptions,
-    output: OutputOptions,
-    free: Sequence[str],
-    bounds: Sequence[str] = (),
-    methods: Sequence[str] = (),
-    tol: float | None = None,
-    max_evaluations: int | None = None,
-    profile: bool = False,
-) -> None:
-    """Fit the parameters `free` (names, also with commas) to the table at `path`, write the result, end the command.
-
-    `bounds` are NAME=LOW:HIGH, `methods` both unless named, `tol` the relative accuracy of each critical load; `profile` refits
-    for intervals. Starts are the system's values. Exit codes: 3 where the limit of evaluations cut a method, 130 where it was
-    interrupted.
-    """
+def _fit_thresholds(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
+    from srfcli.codegen.slider import SlidingSystem
     from srfcli.data.thresholds import read_thresholds
-    from srfcli.inference import thresholds as inference
-    from srfcli.inference.free_parameters import GIVEN, free_parameters, with_transmission
-    from srfcli.results.fit import ThresholdFitResult
+    from srfcli.inference.free_parameters import GIVEN, with_transmission
+    from srfcli.tasks.recordings import fit_thresholds
 
-    table = read_thresholds(path)
-    model = system.model()
-    parameters = with_transmission(model.parameters)
+    table, opener = read_thresholds(source), system.opener()
+    parameters = with_transmission(opener.model.parameters)
     given = next((name for name in GIVEN if name in system.flags), None)
     if given:
-        raise SrfError(f"{given} is set, and {path.name} gives it", f"Leave --set {given} out.")
-    resolved = system.resolve(parameters)
-    scale = free_parameters(
-        parameters, listed(free), start=resolved.values, bounds=dict(_bounds(text, parameters) for text in bounds),
-        largest_eps=float(table.eps.max()), where=model.title,
-    )  # fmt: skip
+        raise SrfError(f"{given} is set, and {source.name} gives it", f"Leave --set {given} out.")
+    slider = SlidingSystem(system.resolve(parameters), opener, opener.model.title)
+    bounds = dict(_bounds(text, parameters) for text in options["bounds"])
     with Progress("fit") as progress:
-
-        def report(trace: Trace) -> None:
-            progress.advance(note=f"{trace.method}, evaluation {len(trace)}: chi2 {trace.best[-1]:.6g}")
-
-        fit = inference.fit_thresholds(
-            model, table, scale=scale, values=resolved.values, methods=methods or inference.METHODS, report=report,
-            tol=system.tolerance(tol).value, profile=profile, max_evaluations=max_evaluations or inference.MAX_EVALUATIONS,
+        found = fit_thresholds(
+            table, slider, free=listed(options["free"]), bounds=bounds, methods=options["method"],
+            tol=system.tolerance(options["tol"]).value, max_evaluations=options["max_evaluations"], profile=options["profile"],
+            progress=lambda text: progress.advance(note=text),
         )  # fmt: skip
-    found = ThresholdFitResult(fit, model.title, {k: v for k, v in resolved.described().items() if k not in GIVEN})
+    methods = found.found.methods
     emit(
-        found.table, output, more=[found.methods, found.trace, found.loads], laws=model.laws, inputs=[path],
-        timings={m.method: m.cpu for m in fit.methods}, figure=found.plot,
+        found.table, output, more=[found.methods, found.trace, found.loads], laws=opener.model.laws, inputs=[source],
+        timings={m.method: m.cpu for m in methods}, figure=found.plot,
     )  # fmt: skip
-    for m in fit.methods:
+    for m in methods:
         Session.current().say(f"{m.method}: {m.evaluations} evaluations, {m.cpu:.1f} s of CPU")
-    finish(fit.status)
+    finish(found.status)
 
 
 def _bounds(text: str, parameters: Sequence[Parameter]) -> tuple[str, tuple[float, float]]:
-    """Return name and bounds in base units that NAME=LOW:HIGH states; raises SrfError that shows the form."""
+    """Return name and bounds in the declared unit that NAME=LOW:HIGH states; raises SrfError that shows the form."""
     name, _, ends = text.partition("=")
     found = parse_ends(name, ends)
     if found is None:
         raise SrfError(f"--bounds {text!r} is not NAME=LOW:HIGH, low below high", "Write --bounds Vsat=100:1000.")
     fitted = found.fitted(parameters)
-    return found.name, (to_base(fitted.lo, fitted.unit), to_base(fitted.hi, fitted.unit))
+    return found.name, (fitted.lo, fitted.hi)

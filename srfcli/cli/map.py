@@ -255,7 +255,7 @@ def compare(
 
 def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, Any]) -> dict[str, SlidingSystem]:
     """Return a system for every pair of a friction and an ageing law, by a name that tells them apart."""
-    from srfcli.codegen.slider import SlidingSystem, opener
+    from srfcli.codegen.slider import Opener, SlidingSystem
 
     toml = load_toml(find_toml())
     chosen = {k: choose(k, system[k], toml=toml) for k in ("interface", "loading", "inertia")}
@@ -268,12 +268,12 @@ def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, 
     if len(pairs) < 2:
         raise SrfError("one law is nothing to compare", "Name more: --law srf-vsat --law log-log, or several --ageing.")
     registry = options.open_registry(system["plugins"], named)
-    openers = [opener(registry, law=law, ageing=ageing, **shared) for law, ageing in pairs]
-    models = [opened(False) for opened in openers]
+    openers = [Opener(registry, {"law": law, "ageing": ageing, **shared}) for law, ageing in pairs]
+    models = [opener.model for opener in openers]
     short = len(set(ageings)) == 1, len(set(laws)) == 1
     names = [law if short[0] else ageing if short[1] else f"{law}/{ageing}" for law, ageing in pairs]
     parts = zip(names, _resolved(models, system, toml), openers, models, strict=True)
-    return {name: SlidingSystem(resolved, opened, model.title) for name, resolved, opened, model in parts}
+    return {name: SlidingSystem(resolved, opener, model.title) for name, resolved, opener, model in parts}
 
 
 def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSettings) -> list[Resolved]:

@@ -42,9 +42,8 @@ from srfcli.results.plots import check_plot
 
 if TYPE_CHECKING:
     from srfcli.codegen.model import GeneratedModel
-    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.codegen.slider import Opener, SlidingSystem
     from srfcli.laws.registry import Registry
-    from srfcli.symbolic.system import System
 
 # Ranges and lists of values on the command line: `--over V=1:100:60:log`, `--over V=1,2,5`, `--V 1,7,25`.
 
@@ -268,24 +267,17 @@ class SystemOptions:
         check_origins(self.toml, {key: self.chosen[key] for key in LAW_CHOICES})
         return {key: setting.value for key, setting in self.chosen.items()}
 
-    def system(self) -> System:
-        """Return the system that the options name."""
-        from srfcli.symbolic.system import build_system
+    def opener(self) -> Opener:
+        """Return what opens the formulas and the models of the system that the options name."""
+        from srfcli.codegen.slider import Opener
 
-        return build_system(self.registry(), **self._names())
+        return Opener(self.registry(), self._names(), self.effects)
 
-    def model(self, *, tables: Sequence[tuple[str, str]] = ()) -> GeneratedModel:
-        """Return the numerical model of that system, with tables if asked for; sympy runs only where the cache has none."""
+    def model(self, *, tables: Sequence[tuple[str, str]]) -> GeneratedModel:
+        """Return the numerical model of that system with tables; sympy runs only where the cache has none."""
         from srfcli.codegen.model import open_model
 
-        if tables:
-            return open_model(self.registry(), **self._names(), tables=tables, effects=self.effects)
-        return self._opener()(False)
-
-    def _opener(self) -> Callable[[bool], GeneratedModel]:
-        from srfcli.codegen.slider import opener
-
-        return opener(self.registry(), self.effects, **self._names())
+        return open_model(self.registry(), **self._names(), tables=tables, effects=self.effects)
 
     def resolve(self, parameters: Sequence[Parameter], **given: str | float | None) -> Resolved:
         """Return every parameter's value and origin.
@@ -309,9 +301,9 @@ class SystemOptions:
         """
         from srfcli.codegen.slider import SlidingSystem, declared
 
-        opened = self._opener()
-        model = opened(moving)
-        return SlidingSystem(self.resolve(declared(model), **given), opened, model.title)
+        opener = self.opener()
+        model = opener.motion if moving else opener.model
+        return SlidingSystem(self.resolve(declared(model), **given), opener, model.title)
 
     def say_defaults(self, resolved: Resolved, names: Iterable[str]) -> None:
         """Say on stderr which of these parameters have the default of their law."""

@@ -14,10 +14,8 @@ from srfcli.cli.emit import Progress, emit
 from srfcli.cli.options import PATH, OutputOptions, open_registry, output_options, plugins_option, reader_option
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import check_target, write_atomic
-from srfcli.core.units import parse_quantity, split_quantity
 
 if TYPE_CHECKING:
-    from srfcli.data.draft import Wish
     from srfcli.laws.registry import Registry
 
 NEW = """
@@ -70,9 +68,8 @@ def new(files: tuple[Path, ...], out: str | None, force: bool, plugins: tuple[Pa
     Columns are recognised by heading and unit; time, what was imposed and what was observed are found in the data. What the
     tables do not contain, the stiffness above all, is taken from the options, or asked for on a terminal.
     """
-    from srfcli.data.columns import open_source
-    from srfcli.data.draft import draft
     from srfcli.laws.registry import load_registry
+    from srfcli.tasks.recordings import new_experiment
 
     place = Path("experiment.toml" if out in (None, "") else str(out)).expanduser()
     if place.is_dir():
@@ -80,67 +77,44 @@ def new(files: tuple[Path, ...], out: str | None, force: bool, plugins: tuple[Pa
     if out != "-":
         check_target(place, force=force)
     registry = load_registry(plugins)
-    places = [path.resolve() for path in files]
-    for number, path in enumerate(files):
-        if places.index(path.resolve()) < number:
-            raise SrfError(f"{path} is named twice", "Name each file once: what counts twice seems known better than it is.")
-        open_source(path, registry=registry, format=options["reader"])
-    wish = _wish(files, options, registry)
-    made = draft(files, place.parent, wish, registry=registry)
+    columns = dict(_column(text) for text in options.pop("columns"))
+    if sys.stdin.isatty() and sys.stderr.isatty():
+        options |= _asked(files[0], columns, options, registry)
+    made = new_experiment(files, folder=place.parent, columns=columns, registry=registry, **options)
     session = Session.current()
-    for column in made.columns:
+    for column in made.draft.columns:
         assumed = ", which no heading says" if column.assumed and column.unit != "1" else ""
         session.say(f"{column.heading!r} is the {column.role.replace('_', ' ')}, in {column.unit}{assumed}")
-    for remark in made.remarks:
+    for remark in made.notes:
         session.say(f"Note: {remark}")
     if out == "-":
         click.echo(made.text, nl=False)
         return
-    write_atomic(place, made.text.encode("utf-8"))
+    write_atomic(place, made.text)
     click.echo(str(place))
     where = "." if place.name == "experiment.toml" and place.parent == Path() else str(place)
     session.say(f"Next: srf check {where}   and then: srf fit {where}")
 
 
-def _wish(files: tuple[Path, ...], options: dict[str, Any], registry: Registry) -> Wish:
-    """Return what the options say; what they leave open is asked for where somebody can answer."""
-    from srfcli.data.draft import Wish
-
-    columns = dict(_column(text) for text in options["columns"])
-    if sys.stdin.isatty() and sys.stderr.isatty():
-        options = options | _asked(files[0], columns, options, registry)
-    if options["stiffness"] is None:
-        raise SrfError(
-            "the stiffness of the machine is in no table",
-            "Say it with --stiffness: '5.4e-3 1/um' (friction per micron), '55 MPa/mm' (shear stress) or '0.21 N/um' (force).",
-        )
-    given = {key: options[key] for key in ("kind", "load", "mass", "law", "ageing", "interface", "title", "reader", "holdout")}
-    return Wish(
-        stiffness=_stiffness(options["stiffness"]), columns=columns, drive=_drive(options["drive"]),
-        window=_window(options["window"]), rig={key: options[key] for key in ("radius", "thickness", "area") if options[key]},
-        **given,
-    )  # fmt: skip
-
-
 def _asked(path: Path, columns: dict[str, str], options: dict[str, Any], registry: Registry) -> dict[str, Any]:
     """Ask for the drive, load and stiffness that neither the first file nor the options say; columns go into `columns`."""
     from srfcli.data.columns import open_source
-    from srfcli.data.draft import OBSERVED, Wish, missing, name_columns
+    from srfcli.data.draft import OBSERVED, missing, name_columns
 
     drive, load, stiffness = options["drive"], options["load"], options["stiffness"]
     headings = open_source(path, registry=registry, format=options["reader"]).headings
     while True:
-        wish = Wish(stiffness or "1 1/um", columns=columns, drive=_drive(drive), load=load)
-        lacks = missing(name_columns(headings, columns, path=path, per_load=False), wish, path, headings)
+        named = name_columns(headings, columns, path=path, per_load=False)
+        lacks = missing(named, path, headings, driven=drive is not None, loaded=load is not None)
         if not lacks:
             break
         option, sentence = lacks[0]
-        if option.startswith("--column time"):
+        if option.startswith("`columns` time"):
             columns["time"] = click.prompt(f"{sentence}. Time", err=True)
-        elif option.startswith("--column"):
+        elif option.startswith("`columns`"):
             role = click.prompt(f"{sentence}.\nWhat was observed", err=True, type=click.Choice(OBSERVED[::-1]))
             columns[role] = click.prompt("In the column", err=True)
-        elif option.startswith("--drive"):
+        elif option.startswith("`drive`"):
             drive = click.prompt(f"{sentence}. Velocity in um/s, or duration:velocity, ...", err=True)
         else:
             load = click.prompt(f"{sentence}. Normal load or stress, as 5 N or 20 MPa", err=True)
@@ -154,38 +128,6 @@ def _column(text: str) -> tuple[str, str]:
     if not (equals and role.strip() and heading.strip()):
         raise SrfError(f"--column {text!r} is no ROLE=HEADING", "As in --column 'shear_stress=tau [MPa]'.")
     return role.strip(), heading.strip()
-
-
-def _stiffness(text: str) -> str:
-    number, unit = split_quantity(text, name="--stiffness", example="5e-3 1/um")
-    if not unit:
-        raise SrfError(
-            f"--stiffness {text!r} has no unit", "'5e-3 1/um' is friction per micron, '55 MPa/mm' shear stress per length."
-        )
-    return f"{number!r} {unit}"
-
-
-def _drive(text: str | None) -> list[tuple[float, float]] | float | None:
-    """Return a drive as (duration, velocity) pairs in s and um/s, or as one velocity."""
-    if text is None:
-        return None
-    if ":" not in text:
-        return parse_quantity(text, "um/s", name="--drive")
-    steps = []
-    for part in text.split(","):
-        duration, _, velocity = part.partition(":")
-        steps.append((parse_quantity(duration, "s", name="--drive"), parse_quantity(velocity, "um/s", name="--drive")))
-    return steps
-
-
-def _window(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    parts = text.replace(":", ",").split(",")
-    if len(parts) != 2:
-        raise SrfError(f"--window {text!r} is not FROM,TO", "As in --window 100,900, in s of the file's own clock.")
-    begin, end = (parse_quantity(part, "s", name="--window") for part in parts)
-    return begin, end
 
 
 @click.command("check", cls=SrfCommand, epilog=CHECK)

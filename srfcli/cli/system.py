@@ -53,7 +53,7 @@ def show(system: SystemOptions, output: OutputOptions) -> None:
         K = "210 N/mm"
         Vsat = 300
     """
-    built = system.system()
+    built = system.opener().formulas
     resolved = system.resolve(built.parameters)
     chosen = {**system.chosen, "tol": system.tolerance()}
     rows: list[tuple[object, ...]] = [(key, s.value, None, s.origin, DEFAULTS[key].about) for key, s in chosen.items()]
@@ -77,13 +77,15 @@ srf derive --format python                       C0..C4 as a NumPy function
 srf derive --check-paper                         what the paper misprints
 """
 FORMATS = ("text", "json", "latex", "python")
-EXTRAS = {"jacobian": ("jacobian",), "parameters": ("parameters",), "all": ("jacobian", "parameters")}
+LONG_PARTS = ("jacobian", "parameters")
 
 
 @click.command("derive", cls=SrfCommand, epilog=DERIVE)
 @system_options
 @click.option("--format", "form", type=click.Choice(FORMATS), default="text", help="What to write.")
-@click.option("--with", "extra", type=click.Choice(tuple(EXTRAS)), multiple=True, help="Add long parts; JSON has all of them.")
+@click.option(
+    "--with", "extra", type=click.Choice((*LONG_PARTS, "all")), multiple=True, help="Add long parts; JSON has all of them."
+)
 @click.option("--check-paper", is_flag=True, help="Compare the paper's printed equations and claims with its own model.")
 @out_option
 def derive(system: SystemOptions, form: str, extra: tuple[str, ...], check_paper: bool, out: Path | None, force: bool) -> None:
@@ -92,35 +94,19 @@ def derive(system: SystemOptions, form: str, extra: tuple[str, ...], check_paper
     The coefficients C0, C1, ... are in the form and normalisation of the paper's appendix. --check-paper looks at the
     paper's own model, whatever law is chosen.
     """
+    from srfcli.tasks import stability as tasks
+
     _check_no_values(system)
-    put(_paper(form) if check_paper else _derive(system, form, extra, plain=out is not None), out, force=force)
-
-
-def _derive(system: SystemOptions, form: str, extra: tuple[str, ...], *, plain: bool) -> str:
-    from srfcli.symbolic import derivation as render
-
-    chosen = system.system()
-    if form == "python":
-        return render.to_python(chosen)
-    wanted = EXTRAS["all"] if form == "json" else [part for name in extra for part in EXTRAS[name]]
-    sections = render.derivation(chosen, wanted)
-    if form == "json":
-        return json.dumps(render.to_document(chosen, sections), indent=2, allow_nan=False) + "\n"
-    if form == "latex":
-        return render.to_latex(chosen, sections)
-    return render.to_text(chosen, sections, unicode=not plain and sys.stdout.isatty())
-
-
-def _paper(form: str) -> str:
-    from srfcli.symbolic import derivation as render
-    from srfcli.symbolic import paper
-
-    if form not in ("text", "json"):
+    if check_paper and form not in ("text", "json"):
         raise SrfError(f"--check-paper has no format {form}", "Choose --format text or --format json.")
-    findings = paper.check_paper()
+    extras = LONG_PARTS if form == "json" or "all" in extra else sorted(set(extra))
+    found = tasks.check_paper() if check_paper else tasks.derive(system.opener(), extras=extras)
     if form == "json":
-        return json.dumps(render.paper_document(findings), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    return render.paper_text(findings)
+        text = json.dumps(found.document, indent=2, ensure_ascii=not check_paper, allow_nan=False) + "\n"
+    else:
+        shown = "pretty" if form == "text" and not check_paper and out is None and sys.stdout.isatty() else form
+        text = getattr(found, shown)
+    put(text, out, force=force)
 
 
 # `srf code`: the NumPy module that computes everything numerical about a system.
@@ -139,8 +125,10 @@ def code(system: SystemOptions, out: Path | None, force: bool) -> None:
 
     Its functions take arrays of any leading shape, real or complex, in um, s, N; the module's PARAMETERS gives their order.
     """
+    from srfcli.tasks import stability as tasks
+
     _check_no_values(system)
-    put(system.model().source, out, force=force)
+    put(tasks.code(system.opener()).text, out, force=force)
 
 
 def _check_no_values(system: SystemOptions) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
@@ -15,6 +15,9 @@ from srfcli.core.errors import SrfError, as_names
 from srfcli.core.settings import DEFAULTS, Parameter, Resolved, resolve
 from srfcli.laws.registry import Registry, chosen_instead, load_registry
 from srfcli.laws.values import Effect, Law
+
+if TYPE_CHECKING:
+    from srfcli.symbolic.system import System
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,8 @@ class SlidingSystem:
     ----------
     resolved : Resolved
         The value of every parameter, and where it comes from.
+    formulas : System
+        The laws joined to one system, as sympy expressions. Raises SrfError if the system has effects.
     model : GeneratedModel
         Functions of arrays, in um, s, N: those of steady sliding and of a modulation that lasts. Raises SrfError for an effect
         that neither depends on.
@@ -33,18 +38,23 @@ class SlidingSystem:
     """
 
     resolved: Resolved = field(repr=False)
-    opened: Callable[[bool], GeneratedModel] = field(repr=False)  # by whether it is for motion in time
+    opener: Opener = field(repr=False)
     title: str
+
+    @property
+    def formulas(self) -> System:
+        """Return the system of formulas, from which the models are generated."""
+        return self.opener.formulas
 
     @property
     def model(self) -> GeneratedModel:
         """Return the model of steady sliding and its stability."""
-        return self.opened(False)
+        return self.opener.model
 
     @property
     def motion(self) -> GeneratedModel:
         """Return the model of motion in time."""
-        return self.opened(True)
+        return self.opener.motion
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -74,7 +84,7 @@ class SlidingSystem:
         """
         kept = {n: v for n, v in self.resolved.declared.items() if self.resolved.origins[n] != "law default"}
         flags = {**kept, **parameters}
-        return SlidingSystem(resolve(self.resolved.parameters, flags, env={}, where=self.title), self.opened, self.title)
+        return SlidingSystem(resolve(self.resolved.parameters, flags, env={}, where=self.title), self.opener, self.title)
 
     def __repr__(self) -> str:
         return f"<SlidingSystem: {self.title}>"
@@ -137,28 +147,50 @@ def system(
     effects = as_names(effects, "effects")
     words = [w.strip() for text in (law, ageing, interface, *effects) for w in text.split("+")]
     registry = load_registry([Path(p) for p in plugins], named=[Path(w) for w in words if w.endswith(".py")])
-    opened = opener(registry, effects, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia)
-    model = opened(bool(why_not_steady(registry, effects)))
+    names = {"law": law, "ageing": ageing, "interface": interface, "loading": loading, "inertia": inertia}
+    opener = Opener(registry, names, effects)
+    model = opener.motion if why_not_steady(registry, effects) else opener.model
     given = {**(parameters or {}), **more}
-    return SlidingSystem(resolve(declared(model), given, env={}, where=model.title), opened, model.title)
+    return SlidingSystem(resolve(declared(model), given, env={}, where=model.title), opener, model.title)
 
 
-def opener(registry: Registry, effects: Sequence[str] = (), **names: Any) -> Callable[[bool], GeneratedModel]:
-    """Return what opens the model of a system, by whether it is for motion in time; `names` are those of `open_model`.
+@dataclass(frozen=True, eq=False)
+class Opener:
+    """Opens the formulas and the models of the system that `names`, those of `open_model`, and effects describe.
 
     Raises SrfError for an effect that only changes what the system is; the model of stability for one that it does not have.
     """
-    check_effects(registry, effects)
 
-    @cache
-    def opened(moving: bool) -> GeneratedModel:
-        if not effects:
-            return open_model(registry, **names) if not moving else opened(False)
-        if not moving and (reason := why_not_steady(registry, effects)):
+    registry: Registry
+    names: Mapping[str, Any]
+    effects: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        check_effects(self.registry, self.effects)
+
+    @property
+    def formulas(self) -> System:
+        """Return the laws joined to a system of formulas; raises SrfError for a system with effects, which have none here."""
+        from srfcli.symbolic.system import build_system
+
+        if self.effects:
+            what = f"effect '{self.effects[0]}' has no part in a derivation"
+            raise SrfError(what, "Leave it out; a modifier is part of the ageing law.")
+        return build_system(self.registry, **self.names)
+
+    @cached_property
+    def model(self) -> GeneratedModel:
+        """Return the model of steady sliding and its stability."""
+        if reason := why_not_steady(self.registry, self.effects):
             raise SrfError(reason, "Leave it out.")
-        return open_model(registry, **names, effects=effects, stability=not moving)
+        return open_model(self.registry, **self.names, effects=self.effects, stability=True)
 
-    return opened
+    @cached_property
+    def motion(self) -> GeneratedModel:
+        """Return the model of motion in time."""
+        if not self.effects:
+            return self.model
+        return open_model(self.registry, **self.names, effects=self.effects, stability=False)
 
 
 def why_not_steady(registry: Registry, effects: Sequence[str]) -> str:

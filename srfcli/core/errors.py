@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 LONGEST_MESSAGE = 2000  # characters of a message
 # control characters but tab and newline, DEL and the second set, marks that are not seen or turn the line round, lone
@@ -90,6 +91,17 @@ def as_names(value: str | Sequence[str], what: str) -> list[str]:
         if name in names[:number]:
             raise SrfError(f"`{what}`: {name!r} is named twice", "Once is enough.")
     return names
+
+
+def as_pairs(given: Any, what: str, like: str) -> list[tuple[float, float]]:
+    """Return pairs of numbers; raises SrfError, which shows one like them, for anything else."""
+    try:
+        pairs = [(float(first), float(second)) for first, second in given]
+    except (TypeError, ValueError):
+        pairs = []
+    if not pairs:
+        raise SrfError(f"`{what}` {given!r} is no list of pairs", f"Give {like}.")
+    return pairs
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -353,16 +353,17 @@ def _exchange(one: Path, other: Path) -> bool:
 def check_target(path: Path, *, force: bool, what: str = "--out") -> None:
     """Raise SrfError now if `path` could not be written later: before an hour of computing, not after it."""
     recover(path)
+    shown = f"{what} {path}".strip()
     if path.is_dir():
-        raise SrfError(f"{what} {path} is a directory", f"Name a file in it: {what} {path / 'result.csv'}")
+        raise SrfError(f"{shown} is a directory", f"Name a file in it: {what} {path / 'result.csv'}")
     if not path.parent.is_dir():
-        raise SrfError(f"{what} {path}: the directory {path.parent} does not exist", f"Create it: mkdir -p {path.parent}")
+        raise SrfError(f"{shown}: the directory {path.parent} does not exist", f"Create it: mkdir -p {path.parent}")
     if is_special(path):
         return
     if path.exists() and not force:
-        raise SrfError(f"{what} {path} exists already", "Overwrite it with --force, or name another file.")
+        raise SrfError(f"{shown} exists already", "Overwrite it with `force`, or name another file.")
     if not os.access(Path(os.path.realpath(path)).parent, os.W_OK):
-        raise SrfError(f"{what} {path}: the directory {path.parent} is not writable", "Name a file elsewhere.", exit_code=1)
+        raise SrfError(f"{shown}: the directory {path.parent} is not writable", "Name a file elsewhere.", exit_code=1)
 
 
 def check_folder_place(folder: Path, *, what: str = "") -> bool:

@@ -107,7 +107,7 @@ RIG = {
     "thickness": "of the sheared layer: strain times it is the displacement",
     "area": "of the sheared contact: force over it is the stress",
 }
-OPTIONS = ("stiffness", "mass", "load", "window", "drive", *RIG)  # what the options of `srf new` say in an experiment
+ARGUMENTS = ("stiffness", "mass", "load", "window", "drive", *RIG)  # of `new_experiment` that an experiment has under their names
 NO_MASS = '# mass = "2.37 kg"   # of the slider; without it the slider is quasi-static'
 
 
@@ -136,10 +136,10 @@ class Wish:
     def geometry(self) -> Geometry:
         """Return what the rig says, in um and mm^2; raises SrfError for a number without a unit."""
         for key, text in self.rig.items():
-            if not split_quantity(text, name=f"--{key}")[1]:
+            if not split_quantity(text, name=f"`{key}`")[1]:
                 unit = "cm^2" if key == "area" else "mm"
-                raise SrfError(f"--{key} '{text}' has no unit", f"Write it with one, as '25 {unit}'.")
-        return Geometry(**{k: parse_quantity(v, GEOMETRY_UNITS[k], name=f"--{k}") for k, v in self.rig.items()})
+                raise SrfError(f"`{key}` '{text}' has no unit", f"Write it with one, as '25 {unit}'.")
+        return Geometry(**{k: parse_quantity(v, GEOMETRY_UNITS[k], name=f"`{k}`") for k, v in self.rig.items()})
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def name_columns(
     found: dict[str, Named] = {}
     for role, text in wish.items():
         if role not in ROLES:
-            raise SrfError(f"--column {role}: no such role", did_you_mean(role, ROLES))
+            raise SrfError(f"`columns` {role}: no such role", did_you_mean(role, ROLES))
         named = _wished(role, text, headings, path, geometry)
         found[named.role] = named
     taken = {named.heading for named in found.values()}
@@ -254,7 +254,7 @@ def _wished(role: str, text: str, headings: Sequence[str], path: Path, geometry:
     found = told or ROLES[role]
     if role == "friction" and _kind_of_unit(found) in ("N", "N*um", "MPa"):
         role = "shear_stress" if _kind_of_unit(found) == "MPa" else "force"
-    check_unit(found, role, where=f"--column {role}", geometry=geometry)
+    check_unit(found, role, where=f"`columns` {role}", geometry=geometry)
     return Named(role, heading, found, True, told is None)
 
 
@@ -294,21 +294,26 @@ def _by_unit(role: str, unit: str | None) -> str | None:
     return role
 
 
-def missing(columns: Sequence[Named], wish: Wish, path: Path, headings: Sequence[str]) -> list[tuple[str, str]]:
-    """Return what a recording needs and is neither in the file nor said: the option that says it, and a sentence."""
+def missing(
+    columns: Sequence[Named], path: Path, headings: Sequence[str], *, driven: bool, loaded: bool
+) -> list[tuple[str, str]]:
+    """Return what a recording needs and is neither in the file nor said: the argument that says it, and a sentence.
+
+    A drive is stated where it is `driven`, a load where it is `loaded`.
+    """
     roles = {named.role for named in columns}
     listed = ", ".join(f"'{h}'" for h in headings)
     lacks = []
     if "time" not in roles:
-        lacks.append(("--column time=HEADING", f"{path}: which column is the time? It has {listed}"))
+        lacks.append(("`columns` time=HEADING", f"{path}: which column is the time? It has {listed}"))
     if not roles & set(OBSERVED):
         what = "friction, shear stress, force or elongation of the spring"
-        lacks.append(("--column shear_stress=HEADING", f"{path}: which column is {what}? It has {listed}"))
-    if wish.drive is None and not roles.intersection(DRIVES):
-        option = "--drive VELOCITY, or --column load_point_displacement=HEADING"
+        lacks.append(("`columns` shear_stress=HEADING", f"{path}: which column is {what}? It has {listed}"))
+    if not (driven or roles.intersection(DRIVES)):
+        option = "`drive` VELOCITY, or `columns` load_point_displacement=HEADING"
         lacks.append((option, f"{path}: which column is the load point's velocity or displacement? It has {listed}"))
-    if wish.load is None and not roles & {"normal_load", "normal_stress", "friction"}:
-        option = "--load '5 N', or --column normal_stress=HEADING"
+    if not (loaded or roles & {"normal_load", "normal_stress", "friction"}):
+        option = "`load` '5 N', or `columns` normal_stress=HEADING"
         lacks.append((option, f"{path}: which column is the normal load or stress? It has {listed}"))
     return lacks
 
@@ -322,7 +327,7 @@ def _check_rig(columns: Sequence[Named], wish: Wish, path: Path) -> None:
         key = "thickness" if strain else needed.get(kind)
         if key is not None and key not in wish.rig:
             what = "strains need the thickness of the layer" if strain else "a rotary rig needs its radius"
-            raise SrfError(f"{path}: '{column.heading}' is in {column.unit}: {what}", f"Say it with --{key} '25 mm'.")
+            raise SrfError(f"{path}: '{column.heading}' is in {column.unit}: {what}", f"Say it with `{key}` '25 mm'.")
 
 
 def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry) -> Draft:
@@ -330,14 +335,14 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
 
     Raises SrfError for what the files do not say and `wish` neither, and for all that reading an experiment refuses.
     """
-    unit = split_quantity(wish.stiffness, name="--stiffness", example="5e-3 1/um")[1]
+    unit = split_quantity(wish.stiffness, name="`stiffness`", example="5e-3 1/um")[1]
     per_load = bool(unit) and find_unit(unit).powers == (-1, 0, 0, 0)
     geometry = wish.geometry()
     try:
         unit_factor(unit or "N/um", "1/um" if per_load else "N/um", geometry)
     except SrfError as error:
         hint = error.hint if error.kind == "unit" else "As '0.21 N/um', '1.5 MPa/mm' or '1e-3 1/um'."
-        raise SrfError(f"--stiffness '{wish.stiffness}': {error.message}", hint) from error
+        raise SrfError(f"`stiffness` '{wish.stiffness}': {error.message}", hint) from error
     named: tuple[Named, ...] = ()
     names: list[str] = []
     remarks: list[str] = []
@@ -345,7 +350,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         names.append(unused_name(path.stem, "", names))
         headings = open_source(path, registry=registry, format=wish.reader).headings
         own = name_columns(headings, wish.columns, path=path, per_load=per_load, geometry=geometry)
-        lacks = missing(own, wish, path, headings)
+        lacks = missing(own, path, headings, driven=wish.drive is not None, loaded=wish.load is not None)
         if lacks:
             raise SrfError(lacks[0][1], " ".join(f"Say it with {option}." for option, _ in lacks))
         _check_rig(own, wish, path)
@@ -359,9 +364,9 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     remarks += told
     for name in wish.holdout:
         if name not in sketch.names:
-            raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, sketch.names))
+            raise SrfError(f"`holdout` {name}: no such run", did_you_mean(name, sketch.names))
     if set(wish.holdout) >= set(sketch.names):
-        raise SrfError("--holdout: every run is held out", "Leave one to be fitted.")
+        raise SrfError("`holdout`: every run is held out", "Leave one to be fitted.")
     sketch, read = _read(sketch, registry)
     runs = list(read.runs)
     remarks += [*told_of_runs(runs, MISREAD), *filter(None, [read.rescaled()])]
@@ -434,7 +439,7 @@ def _signs(columns: Columns, turning: bool) -> dict[str, int]:
     if observed is None or turning:
         return found
     if not np.any(arrays[observed]):
-        raise SrfError(f"{columns.place(observed).column} is 0 throughout", f"Name another column: --column {observed}=HEADING.")
+        raise SrfError(f"{columns.place(observed).column} is 0 throughout", f"Name another column: `columns` {observed}=HEADING.")
     found["observed"] = -1 if np.nanmedian(arrays[observed]) < 0 else 1
     if drive is not None and found["observed"] > 0:
         found[drive] = -1 if goes_backward(drive, arrays[drive]) else 1
@@ -451,7 +456,7 @@ def _as_file(text: str) -> Iterator[Path]:
             yield file
         except SrfError as error:
             plain = re.sub(rf"{re.escape(str(file))}(, line \d+)?: ", "", error.message)
-            error.message = re.sub(rf"^(?:apparatus|runs\[\d+\])\.({'|'.join(OPTIONS)}): ", r"--\1: ", plain)
+            error.message = re.sub(rf"^(?:apparatus|runs\[\d+\])\.({'|'.join(ARGUMENTS)}): ", r"`\1`: ", plain)
             raise
 
 
@@ -559,7 +564,7 @@ def _read(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, Experiment]:
                 sketch = replace(sketch, free=(*sketch.free, error.run))
             except SrfError as error:
                 if error.kind == "no contact":
-                    error.hint = "Take the part in contact: --window FROM,TO in seconds."
+                    error.hint = "Take the part in contact: `window` FROM,TO in seconds."
                 raise
 
 
@@ -648,7 +653,7 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
             low = p.lower if any(p in each.parameters for each in modifiers) else low  # there may be nothing of it
             held = ", fixed = true" if not low < high else f", lower = {low}, upper = {high}"
             lines.append(f"{p.name} = {{ value = {p.default!r}{held} }}{about}")
-    number, unit = split_quantity(wish.stiffness, name="--stiffness")
+    number, unit = split_quantity(wish.stiffness, name="`stiffness`")
     pair = f'lower = "{_short(number / 2)} {unit}", upper = "{_short(2 * number)} {unit}"'
     lines.append(f'# K = {{ value = "{wish.stiffness}", {pair} }}   # take the # away to fit the stiffness, too')
     return lines

@@ -1,4 +1,4 @@
-"""What `srf check` found: every run's sampling, flaws, noise, drive and load, and what its load can tell."""
+"""A drafted experiment; what `srf check` found: each run's sampling, flaws, noise, drive and load, and what its load can tell."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,14 +18,52 @@ from srfcli.data.values import Experiment, shown_unit
 from srfcli.results import plots
 from srfcli.results.figures import recordings
 from srfcli.results.report_text import joined
-from srfcli.results.tables import Column, Result, Table
+from srfcli.results.tables import Column, Result, Table, TextResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from srfcli.data.draft import Draft
     from srfcli.data.experiment import RunCheck
     from srfcli.inference.cramer_rao import CramerRaoBound, Forecast
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class DraftResult(TextResult):
+    """A commented experiment.toml for recordings.
+
+    Attributes
+    ----------
+    draft : Draft
+        The text, the roles of the columns, and remarks on what was decided and why.
+    folder : path
+        Where the file will stand; the places of the recordings are written as seen from there.
+    """
+
+    draft: Draft = field(repr=False)
+    folder: Path
+
+    @property
+    def text(self) -> str:
+        """Return the text of the file."""
+        return self.draft.text
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each column that plays a role; notes are what was decided."""
+        columns = (
+            Column("role", "", "what the column is"),
+            Column("heading", "", "as the file has it"),
+            Column("unit", "", "of its numbers"),
+            Column("assumed", "", "whether nobody told the unit"),
+        )
+        rows = [(c.role, c.heading, c.unit, c.assumed) for c in self.draft.columns]
+        return Table("srf.new/1", columns, rows, "Columns of the recordings", self.draft.remarks)
+
+    def write(self, path: Path | str | None = None, *, force: bool = False) -> None:
+        """Write the text to experiment.toml in the folder, or to a file of another name there, whole or not at all."""
+        super().write(self.folder / (path or "experiment.toml"), force=force)
 
 
 @dataclass(frozen=True, repr=False, eq=False)

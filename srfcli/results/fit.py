@@ -574,6 +574,16 @@ class ThresholdFitResult(Result):
     held: Mapping[str, Mapping[str, Any]] = field(repr=False)
 
     @property
+    def values(self) -> dict[str, float]:
+        """Return name -> estimate of the method with the lowest chi2, in um, s, N."""
+        return dict(zip(self.found.scale.names, self.found.best.values.tolist(), strict=True))
+
+    @property
+    def stderr(self) -> dict[str, float]:
+        """Return name -> standard error of that estimate, in um, s, N; NaN at a bound, infinite where nothing is known."""
+        return dict(zip(self.found.scale.names, self.found.best.uncertainty.errors.tolist(), strict=True))
+
+    @property
     def _freedom(self) -> int:
         return len(self.found.table) - len(self.found.scale)
 

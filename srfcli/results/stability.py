@@ -1,7 +1,9 @@
-"""Stability of sliding: under constant load, of one forced periodic state, and the boundary under modulation."""
+"""Formulas of a system; its stability under constant load, of one forced periodic state, and the boundary under modulation."""
 
 from __future__ import annotations
 
+import ast
+import html
 import itertools
 import math
 from collections.abc import Mapping
@@ -16,9 +18,10 @@ from srfcli.core.errors import Status, worst
 from srfcli.numerics.hopf import critical_point
 from srfcli.results import plots
 from srfcli.results.figures import gains
-from srfcli.results.tables import STATUS, Column, Result, Table
+from srfcli.results.tables import STATUS, Column, Result, Table, TextResult
 
 if TYPE_CHECKING:
+    import sympy as sp
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -27,6 +30,156 @@ if TYPE_CHECKING:
     from srfcli.numerics.continuation import Boundary
     from srfcli.numerics.floquet import FloquetResult
     from srfcli.numerics.response import LinearResponse, MeanFriction
+    from srfcli.symbolic.derivation import Section
+    from srfcli.symbolic.paper import Finding
+    from srfcli.symbolic.system import System
+
+# What follows by algebra, the paper's equations held against it, and the module that computes with it.
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class DerivationResult(TextResult):
+    """What follows from a system's laws by algebra, in the letters and normalisation of the paper.
+
+    Attributes
+    ----------
+    system : System
+        The laws as one system of formulas.
+    extras : tuple of str
+        The long parts that were asked for.
+    """
+
+    system: System = field(repr=False)
+    extras: tuple[str, ...] = ()
+
+    @cached_property
+    def sections(self) -> tuple[Section, ...]:
+        """Return the parts of the derivation, each with its named formulas and notes."""
+        from srfcli.symbolic.derivation import derivation
+
+        return derivation(self.system, self.extras)
+
+    @property
+    def formulas(self) -> dict[str, sp.Expr]:
+        """Return name -> sympy expression of every formula."""
+        return {formula.name: formula.value for section in self.sections for formula in section.formulas}
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each formula, as text and as LaTeX."""
+        columns = (Column("part", ""), Column("name", ""), Column("formula", ""), Column("latex", "", "name = formula"))
+        parts = self.document["sections"]
+        rows = [(p["key"], f["name"], f["text"], f"{f['latex_name']} = {f['latex']}") for p in parts for f in p["formulas"]]
+        notes = tuple(note for part in parts for note in part["notes"])
+        return Table("srf.derive.table/1", columns, rows, self.system.title, notes)
+
+    @property
+    def text(self) -> str:
+        """Return the formulas as plain text, one a line."""
+        from srfcli.symbolic.derivation import to_text
+
+        return to_text(self.system, self.sections, unicode=False)
+
+    @property
+    def pretty(self) -> str:
+        """Return the formulas over several lines in Unicode."""
+        from srfcli.symbolic.derivation import to_text
+
+        return to_text(self.system, self.sections, unicode=True)
+
+    @property
+    def latex(self) -> str:
+        """Return a LaTeX document, which needs amsmath."""
+        from srfcli.symbolic.derivation import to_latex
+
+        return to_latex(self.system, self.sections)
+
+    @property
+    def python(self) -> str:
+        """Return a NumPy function of the coefficients of the dispersion relation, in um, s, N."""
+        from srfcli.symbolic.derivation import to_python
+
+        return to_python(self.system)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """Return the formulas as plain data, which `srf derive --format json` prints."""
+        from srfcli.symbolic.derivation import to_document
+
+        return to_document(self.system, self.sections)
+
+    def _repr_html_(self) -> str:
+        """Return the formulas for a notebook, which sets what stands between dollar signs."""
+        parts = [f"<b>{html.escape(self.system.title)}</b>"]
+        for section in self.document["sections"]:
+            parts.append(f"<h4>{html.escape(section['title'])}</h4>")
+            parts += [f"<p>${html.escape(f['latex_name'])} = {html.escape(f['latex'])}$</p>" for f in section["formulas"]]
+            parts += [f"<p>{html.escape(note)}</p>" for note in section["notes"]]
+        return f"<div>{''.join(parts)}</div>"
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class PaperResult(TextResult):
+    """The printed equations, claims and words of the paper, held against its own model.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        What is printed, where, whether it holds and what is right.
+    """
+
+    findings: tuple[Finding, ...] = field(repr=False)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each finding."""
+        about = {"line": "of the manuscript's source", "right": "what follows from the model"}
+        findings = self.document["findings"]
+        columns = tuple(Column(name, "", about.get(name, "")) for name in findings[0])
+        rows = [tuple(finding.values()) for finding in findings]
+        return Table("srf.derive-paper.table/1", columns, rows, "The paper's equations, claims and words")
+
+    @property
+    def text(self) -> str:
+        """Return the findings as text: equations, claims and words."""
+        from srfcli.symbolic.derivation import paper_text
+
+        return paper_text(self.findings)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """Return the findings as plain data, which `srf derive --check-paper --format json` prints."""
+        from srfcli.symbolic.derivation import paper_document
+
+        return paper_document(self.findings)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class CodeResult(TextResult):
+    """The generated NumPy module of a system.
+
+    Attributes
+    ----------
+    model : GeneratedModel
+        The module, loaded: its functions, and the parameters in the order in which these take them.
+    """
+
+    model: GeneratedModel
+
+    @property
+    def text(self) -> str:
+        """Return the text of the module, which needs NumPy alone."""
+        return self.model.source
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each function of the module: its arguments, and what it returns."""
+        columns = (Column("function", "", "name"), Column("arguments", "", "arrays of any leading shape"), Column("returns", ""))
+        found = (f for f in ast.parse(self.text).body if isinstance(f, ast.FunctionDef) and not f.name.startswith("_"))
+        rows = [(f.name, ", ".join(a.arg for a in f.args.args), (ast.get_docstring(f) or "").partition("\n")[0]) for f in found]
+        notes = (f"p: {', '.join(self.model.names)}", f"x: {', '.join(self.model.states)}", "units um, s, N")
+        return Table("srf.code/1", columns, rows, self.model.title, notes)
+
 
 # Steady sliding under constant load: critical loads from the characteristic polynomial.
 

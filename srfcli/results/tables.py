@@ -13,10 +13,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from srfcli.core import __version__
 from srfcli.core.errors import SrfError, Status, printable
+from srfcli.core.files import check_target, write_atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -363,6 +365,33 @@ class Result(ABC):
     def _repr_html_(self) -> str:
         """Return the table for a notebook: its first rows, and the notes."""
         return self.table._repr_html_()
+
+
+class TextResult(Result):
+    """Result that is a text first of all: formulas, a program, a description. `table` lists what is in it."""
+
+    @property
+    @abstractmethod
+    def text(self) -> str:
+        """Return the text, as the command prints it."""
+
+    def write(self, path: Path | str, *, force: bool = False) -> None:
+        """Write the text to a file, whole or not at all.
+
+        Raises
+        ------
+        SrfError
+            For a file that exists, unless `force`, or that cannot be written.
+        """
+        check_target(Path(path), force=force, what="")
+        write_atomic(Path(path), self.text)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Raise SrfError: a text has no figure."""
+        raise SrfError(f"{type(self).__name__} has no figure", "Print it, or look at `table`.")
+
+    def __str__(self) -> str:
+        return self.text.rstrip("\n")
 
 
 def load_xarray() -> Any:

@@ -1,4 +1,4 @@
-"""Recordings: read, checked and fitted, one experiment or many, a row each."""
+"""Recordings: described, read, checked and fitted, one experiment or many, a row each; critical loads, fitted alone."""
 
 from __future__ import annotations
 
@@ -9,25 +9,176 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srfcli.core.errors import SrfError, Status, as_names, check_choice
+from srfcli.core.errors import SrfError, Status, as_names, as_pairs, check_choice
 from srfcli.core.parallel import Runner, run_here
-from srfcli.core.units import from_base
+from srfcli.core.settings import resolve
+from srfcli.core.units import from_base, parse_quantity, split_quantity, to_base
 from srfcli.data import experiment as description
+from srfcli.data.columns import open_source
+from srfcli.data.draft import Wish, draft
 from srfcli.data.groups import BY
+from srfcli.data.thresholds import Thresholds, read_thresholds
 from srfcli.data.values import Experiment, Run
 from srfcli.inference import posterior as posteriors
+from srfcli.inference import thresholds
 from srfcli.inference.cramer_rao import forecast
+from srfcli.inference.free_parameters import GIVEN, RHO, free_parameters
 from srfcli.inference.noise import lag_one
 from srfcli.inference.posterior import Posterior
 from srfcli.inference.profile import Interval
 from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import Registry, load_registry
-from srfcli.results.check import CheckResult
-from srfcli.results.fit import PAIRS, CampaignResult, FitResult
+from srfcli.results.check import CheckResult, DraftResult
+from srfcli.results.fit import PAIRS, CampaignResult, FitResult, ThresholdFitResult
+
+if TYPE_CHECKING:
+    from srfcli.codegen.slider import SlidingSystem
+
+
+def new_experiment(
+    files: Path | str | Sequence[Path | str],
+    *,
+    stiffness: str | None,
+    folder: Path | str = ".",
+    kind: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    drive: float | str | Sequence[tuple[float, float]] | None = None,
+    load: str | None = None,
+    window: tuple[float, float] | str | None = None,
+    mass: str | None = None,
+    radius: str | None = None,
+    thickness: str | None = None,
+    area: str | None = None,
+    law: str = "dieterich-ruina",
+    ageing: str | None = None,
+    interface: str = "rigid",
+    holdout: Sequence[str] = (),
+    title: str = "",
+    reader: str | None = None,
+    plugins: Sequence[str | Path] = (),
+    registry: Registry | None = None,
+) -> DraftResult:
+    """Return a commented experiment.toml for recordings, which `srfcli.check` and `srfcli.fit` take.
+
+    Columns are recognised by heading and unit; time, what was imposed and what was observed are found in the data.
+
+    Parameters
+    ----------
+    files : path or sequence of path
+        Tables of recorded numbers, a run each.
+    stiffness : str
+        Stiffness of the machine with its unit: '0.21 N/um', '55 MPa/mm', or friction per micron, '5e-3 1/um'.
+    folder : path
+        Where experiment.toml will stand.
+    kind : {'steps', 'shs', 'oscillation'}, optional
+        Velocity steps, slide-hold-slide, or an oscillating load; as found in the data if left out.
+    columns : mapping from role to heading, optional
+        Which column plays a role, with its unit in brackets where the heading has none: {'shear_stress': 'S [kPa]'}.
+    drive : number, text or sequence of (duration, velocity), optional
+        What was imposed, if no column has it: in s and um/s, or text as '60:3, 60:10'.
+    load : str, optional
+        Constant normal load or stress, if no column has it: '5 N', '20 MPa'.
+    window : (float, float) or text, optional
+        Only this part of the recordings, in s of the file's clock.
+    mass : str, optional
+        Mass of the slider, '2.37 kg'; without it the slider is quasi-static.
+    radius, thickness, area : str, optional
+        Of a rotary rig, of a sheared layer, of the sliding contact: '25 mm', '4 mm', '25 cm^2'.
+    law, ageing, interface : str
+        Names of laws. The ageing law is dieterich, with Linker's term where the load oscillates, if left out.
+    holdout : sequence of str
+        Runs that no fit sees.
+    title : str
+        Title of the experiment.
+    reader : str, optional
+        Reader of all files; each is told from its name and content if left out.
+    plugins : sequence of path
+        Folders in which laws and readers are looked for, too.
+    registry : Registry, optional
+        An open registry of laws and readers; loaded from `plugins` and the usual places if left out.
+
+    Returns
+    -------
+    DraftResult
+        `.text` is the file, `.write()` keeps it, `.table` says which column was taken for what, `.notes` what was decided.
+
+    Raises
+    ------
+    SrfError
+        For a file that cannot be read, a role that no column plays and no argument states, a value without a unit.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import srfcli as srf
+    >>> rows = [f"{0.1 * i:.1f},{3 if i < 99 else 10},{0.6 + 1e-4 * (i % 3)}" for i in range(200)]
+    >>> _ = Path("run.csv").write_text("\\n".join(["time [s],lp_velocity [um/s],mu", *rows]))
+    >>> made = srf.new_experiment("run.csv", stiffness="3e-3 1/um", load="10 MPa")
+    >>> [(row[0], row[1]) for row in made.table.rows]
+    [('time', 'time [s]'), ('load_point_velocity', 'lp_velocity [um/s]'), ('friction', 'mu')]
+    >>> made.write(force=True)
+    >>> srf.read_experiment(".").runs[0].name
+    'run'
+    """
+    check_choice("kind", kind, ("steps", "shs", "oscillation"))
+    registry = registry or load_registry([Path(p) for p in plugins])
+    places = [Path(p) for p in ([files] if isinstance(files, str | Path) else files)]
+    found = [path.resolve() for path in places]
+    if not places:
+        raise SrfError("there are no recordings to describe", "Name one file or more.")
+    for number, path in enumerate(places):
+        if found.index(found[number]) < number:
+            raise SrfError(f"{path} is named twice", "Name each file once: what counts twice seems known better than it is.")
+        open_source(path, registry=registry, format=reader)
+    if stiffness is None:
+        raise SrfError(
+            "the stiffness of the machine is in no table",
+            "Say it with `stiffness`: '5.4e-3 1/um' (friction per micron), '55 MPa/mm' (shear stress) or '0.21 N/um' (force).",
+        )
+    wish = Wish(
+        stiffness=_stiffness(stiffness), kind=kind, columns=columns or {}, drive=_drive(drive), load=load, mass=mass,
+        window=_window(window), law=law, ageing=ageing, interface=interface, title=title, reader=reader, holdout=tuple(holdout),
+        rig={key: text for key, text in (("radius", radius), ("thickness", thickness), ("area", area)) if text},
+    )  # fmt: skip
+    return DraftResult(draft(places, Path(folder), wish, registry=registry), Path(folder))
+
+
+def _stiffness(text: str) -> str:
+    number, unit = split_quantity(text, name="`stiffness`", example="5e-3 1/um")
+    if not unit:
+        raise SrfError(
+            f"`stiffness` {text!r} has no unit", "'5e-3 1/um' is friction per micron, '55 MPa/mm' shear stress per length."
+        )
+    return f"{number!r} {unit}"
+
+
+def _drive(given: Any) -> list[tuple[float, float]] | float | None:
+    """Return a drive as (duration, velocity) pairs in s and um/s, or as one velocity."""
+    if given is None or isinstance(given, int | float):
+        return None if given is None else float(given)
+    if not isinstance(given, str):
+        return as_pairs(given, "drive", "(duration, velocity) pairs, in s and um/s: [(60, 3), (60, 10)]")
+    if ":" not in given:
+        return parse_quantity(given, "um/s", name="`drive`")
+    steps = []
+    for part in given.split(","):
+        duration, _, velocity = part.partition(":")
+        steps.append((parse_quantity(duration, "s", name="`drive`"), parse_quantity(velocity, "um/s", name="`drive`")))
+    return steps
+
+
+def _window(given: tuple[float, float] | str | None) -> tuple[float, float] | None:
+    if not isinstance(given, str):
+        return given if given is None else as_pairs([given], "window", "two times in s of the file's clock: (100, 900)")[0]
+    parts = given.replace(":", ",").split(",")
+    if len(parts) != 2:
+        raise SrfError(f"`window` {given!r} is not FROM,TO", "As in `window` 100,900, in s of the file's own clock.")
+    begin, end = (parse_quantity(part, "s", name="`window`") for part in parts)
+    return begin, end
 
 
 def read_experiment(
@@ -292,6 +443,108 @@ def fit(
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
     return FitResult(found, tuple(intervals), posterior, starts, status)
+
+
+# Critical loads alone, as in the paper.
+
+
+def fit_thresholds(
+    table: Thresholds | Path | str,
+    system: SlidingSystem,
+    *,
+    free: str | Sequence[str],
+    rho: float | str = RHO.default,
+    bounds: Mapping[str, tuple[float | str, float | str]] | None = None,
+    methods: str | Sequence[str] = (),
+    tol: float = 1e-6,
+    max_evaluations: int | None = None,
+    profile: bool = False,
+    progress: Callable[[str], None] = lambda text: None,
+) -> ThresholdFitResult:
+    """Return the parameters that minimise chi2 of measured critical loads, by the paper's method and by least squares.
+
+    Each load is compared with the nearest of the model at which stability is lost. Both methods begin at the values of `system`
+    and minimise the same cost.
+
+    Parameters
+    ----------
+    table : path or Thresholds
+        A CSV file with V (um/s), eps, W0c (N) and, if known, sigma (N), a line for each load.
+    system : SlidingSystem
+        The slider, from `srfcli.system`; the table gives V, eps and W0.
+    free : str or sequence of str
+        Parameters to fit, also 'rho'.
+    rho : number or text
+        Share of the modulation that reaches the asperities, 1 in full, or where its fit begins.
+    bounds : mapping from parameter to (low, high), optional
+        In declared units, or text with a unit; those of the law and a factor of ten around the start if left out.
+    methods : str or sequence of str
+        'powell', 'least-squares'; both if left out.
+    tol : float
+        Relative error of a computed load.
+    max_evaluations : int, optional
+        Most evaluations of the cost, for each method.
+    profile : bool
+        Whether the intervals are those of the profile likelihood.
+    progress : callable
+        Told the method, its evaluations and the lowest chi2 after each of them.
+
+    Returns
+    -------
+    ThresholdFitResult
+        `.values` and `.stderr` of the best method. Ctrl-C is a status: the best parameters so far.
+
+    Raises
+    ------
+    SrfError
+        For a table that cannot be read or has fewer loads than there are free parameters, an unknown parameter or method, and
+        bounds that exclude the start.
+
+    References
+    ----------
+    Cochard, Bureau and Baumberger (2003), Trans. ASME J. Appl. Mech. 70, 220: the procedure. Powell (1964), Comput. J. 7, 155.
+    Branch, Coleman and Li (1999), SIAM J. Sci. Comput. 21, 1: the least squares.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import srfcli as srf
+    >>> slider = srf.system()
+    >>> true = srf.linear(slider, over={"V": [1, 5, 20, 60]}).table.records()
+    >>> _ = Path("loads.csv").write_text("V,eps,W0c\\n" + "".join(f"{x['V']},0,{x['W0']}\\n" for x in true))
+    >>> found = srf.fit_thresholds("loads.csv", slider.at(D0=0.5), free="D0", methods="least-squares")
+    >>> round(found.values["D0"], 4)
+    0.402
+    """
+    if not isinstance(table, Thresholds):
+        table = read_thresholds(Path(table))
+    known = system.resolved
+    if RHO.name not in known.values:
+        own = {name: value for name, value in known.declared.items() if known.origins[name] != "law default"}
+        known = resolve((*known.parameters, RHO), {**own, RHO.name: rho}, env={}, where=system.title)
+    units = {p.name: p.unit for p in known.parameters}
+    scale = free_parameters(
+        known.parameters, free.split(",") if isinstance(free, str) else free, start=known.values, where=system.title,
+        bounds={name: _ends(name, pair, units.get(name, "1")) for name, pair in (bounds or {}).items()},
+        largest_eps=float(table.eps.max()),
+    )  # fmt: skip
+    chosen = [methods] if isinstance(methods, str) else methods
+    found = thresholds.fit_thresholds(
+        system.model, table, scale=scale, values=known.values, methods=chosen or thresholds.METHODS, tol=tol, profile=profile,
+        max_evaluations=max_evaluations or thresholds.MAX_EVALUATIONS,
+        report=lambda trace: progress(f"{trace.method}, evaluation {len(trace)}: chi2 {trace.best[-1]:.6g}"),
+    )  # fmt: skip
+    held = {name: value for name, value in known.described().items() if name not in GIVEN}
+    return ThresholdFitResult(found, system.title, held)
+
+
+def _ends(name: str, pair: Any, unit: str) -> tuple[float, float]:
+    """Return bounds, numbers in their declared unit or text with a unit, in um, s, N."""
+    try:
+        low, high = (to_base(parse_quantity(x, unit, name=name) if isinstance(x, str) else float(x), unit) for x in pair)
+    except (TypeError, ValueError):
+        raise SrfError(f"`bounds` of {name}: {pair!r} is no pair of numbers", f"Like {{'{name}': (1, 10)}}.") from None
+    return low, high
 
 
 # A campaign: many experiments, a row each, whatever becomes of the others.

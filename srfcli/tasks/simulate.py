@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.codegen.slider import SlidingSystem, declared
 from srfcli.codegen.splines import appended
-from srfcli.core.errors import SrfError, Status, did_you_mean, worst
+from srfcli.core.errors import SrfError, Status, as_pairs, did_you_mean, worst
 from srfcli.core.settings import Parameter, check_value, require_parameter
 from srfcli.core.units import find_unit, from_base, parse_quantity, split_quantity, tidy, to_base
 from srfcli.data.description import MOST_OBSERVABLES
@@ -101,23 +101,12 @@ def simulate(
     if drive is None:
         drive = Drive.constant(system.resolved.values["V"])
     elif not isinstance(drive, Drive):
-        drive = Drive.steps(_pairs(drive, "drive", "times in s and velocities in um/s: [(0, 10), (2, 20)]"))
+        drive = Drive.steps(as_pairs(drive, "drive", "times in s and velocities in um/s: [(0, 10), (2, 20)]"))
     if load is not None and not isinstance(load, Load):
-        pieces = _pairs(load, "load", "durations in s and loads in N: [(2, 5), (2, 7)]")
+        pieces = as_pairs(load, "load", "durations in s and loads in N: [(2, 5), (2, 7)]")
         load = LoadSteps.sequence([(length, W, W) for length, W in pieces], start=float(times[0]), rise=STEP_RISE)
     work = record_of(system, t=times, drive=drive, load=load, onset=onset, start=start, observables=observables)
     return simulate_work(work, rtol=rtol)
-
-
-def _pairs(given: Any, name: str, like: str) -> list[tuple[float, float]]:
-    """Return pairs of numbers; raises SrfError for anything else."""
-    try:
-        pairs = [(float(first), float(second)) for first, second in given]
-    except (TypeError, ValueError):
-        pairs = []
-    if not pairs:
-        raise SrfError(f"`{name}` {given!r} is no list of pairs", f"Give {like}.")
-    return pairs
 
 
 def simulate_work(

@@ -1,4 +1,4 @@
-"""`linear`, `response`, `floquet`, `critical` and `continue`: sliding under a constant and under a modulated load."""
+"""`derive`, `code`: a system's formulas; `linear`, `response`, `floquet`, `critical`, `continue`: its sliding and stability."""
 
 from __future__ import annotations
 
@@ -11,22 +11,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
-from srfcli.core.errors import SrfError, Status, worst
+from srfcli.core.errors import SrfError, Status, as_names, check_choice, worst
 from srfcli.core.settings import check_value, require_parameter
 from srfcli.core.units import to_base
 from srfcli.numerics.hopf import HopfPoint, closed_forms, hopf_points, steady_is_stable, weakening
 from srfcli.numerics.plane import Axis, Plane, check_count
 from srfcli.results.stability import (
     BoundaryResult,
+    CodeResult,
     CriticalResult,
+    DerivationResult,
     LinearResult,
     MeanFrictionResult,
+    PaperResult,
     PeriodicResult,
     ResponseResult,
 )
 
 if TYPE_CHECKING:
-    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.codegen.slider import Opener, SlidingSystem
     from srfcli.numerics.continuation import Boundary, ContinuationSettings
     from srfcli.numerics.critical import CriticalLine, LoadWindow
 
@@ -59,6 +62,86 @@ def _ends(model: GeneratedModel, window: Any) -> tuple[float, float]:
     if len(ends) != 2 or not 0 < ends[0] < ends[1]:
         raise SrfError(f"`window` {window!r} is not two rising loads above 0", "Like (4, 500).")
     return ends[0], ends[1]
+
+
+# `derive` and `code`: what follows from the laws by algebra, whatever the values.
+
+
+def derive(system: SlidingSystem | Opener, *, extras: str | Sequence[str] = ()) -> DerivationResult:
+    """Return steady state, slopes of friction, equations, dispersion relation and closed critical loads, by algebra.
+
+    The coefficients C0, C1, ... of the dispersion relation are in the form and normalisation of the paper's appendix.
+
+    Parameters
+    ----------
+    system : SlidingSystem
+        The slider, from `srfcli.system`; the values of its parameters do not matter.
+    extras : str or sequence of str
+        Long parts: 'jacobian' of the equations, and their derivatives by the 'parameters'.
+
+    Returns
+    -------
+    DerivationResult
+        `.formulas` as sympy expressions; `.text`, `.latex`, `.python`, `.document`.
+
+    Raises
+    ------
+    SrfError
+        For an unknown part, or a system with effects.
+
+    References
+    ----------
+    Cochard, Bureau and Baumberger (2003), Trans. ASME J. Appl. Mech. 70, 220: the appendix.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> found = srf.derive(srf.system())
+    >>> found.formulas["W0c"]
+    (D0 - lambda*(mu_phi - mu_v))*(K - M*Omega_c**2)/(mu_phi - mu_v)
+    """
+    from srfcli.symbolic.derivation import EXTRAS
+
+    extras = as_names(extras, "extras")
+    for name in extras:
+        check_choice("extras", name, EXTRAS)
+    return DerivationResult(system.formulas, tuple(extras))
+
+
+def check_paper() -> PaperResult:
+    """Return the paper's printed equations, claims and words, held against what follows from its own model."""
+    from srfcli.symbolic import paper
+
+    return PaperResult(tuple(paper.check_paper()))
+
+
+def code(system: SlidingSystem | Opener) -> CodeResult:
+    """Return the NumPy module that computes everything numerical about steady sliding and its stability.
+
+    Parameters
+    ----------
+    system : SlidingSystem
+        The slider, from `srfcli.system`; the module takes the values of its parameters as arguments, in um, s, N.
+
+    Returns
+    -------
+    CodeResult
+        `.text` is the module, `.write(path)` keeps it, `.table` lists its functions.
+
+    Raises
+    ------
+    SrfError
+        For a system with an effect that steady sliding does not depend on.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> module = srf.code(srf.system("dieterich-ruina"))
+    >>> module.table.rows[0]
+    ('positive_ratio', 'above, below', 'above/below where that is positive, else nan.')
+    >>> module.write("model.py")
+    """
+    return CodeResult(system.model)
 
 
 # `linear`: stability of steady sliding under constant load.
