@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from srfcli.tasks.stability import floquet as floquet
     from srfcli.tasks.stability import linear as linear
     from srfcli.tasks.stability import response as response
+    from srfcli.validation.trials import prove as prove
 
 
 # name: the module that has it, imported when the name is first used
@@ -63,6 +64,7 @@ PUBLIC = {
     "fit": "srfcli.tasks.recordings",
     "fit_thresholds": "srfcli.tasks.recordings",
     "new_experiment": "srfcli.tasks.recordings",
+    "prove": "srfcli.validation.trials",
     "read_experiment": "srfcli.tasks.recordings",
     "simulate": "srfcli.tasks.simulate",
     "system": "srfcli.codegen.slider",

@@ -295,6 +295,10 @@ WRONG = {
     "a kind of experiment": (lambda s: srf.new_experiment([], stiffness="1 N/um", kind="slow"), "`kind`: 'slow'"),
     "no recordings": (lambda s: srf.new_experiment([], stiffness="1 N/um"), "no recordings"),
     "no table": (lambda s: srf.fit_thresholds("here.csv", s, free="A"), "here.csv"),
+    "no trial": (lambda s: srf.prove("here", report_only=True), "no trial"),
+    "no cases": (lambda s: srf.prove("here", cases=0), "one case or more"),
+    "a bank": (lambda s: srf.prove("here", bank="narrow"), "`bank`: 'narrow'"),
+    "what a report asks": (lambda s: srf.prove("here", report_only=True, seed=0), "`seed` has no meaning"),
     "what varies by what": (lambda s: srf.diagnose("here", by="weekday"), "`by`: 'weekday'"),
 }
 

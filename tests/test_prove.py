@@ -25,6 +25,7 @@ from srfcli.cli.main import main
 from srfcli.core.errors import SrfError
 from srfcli.core.parallel import run_processes
 from srfcli.laws.registry import load_registry
+from srfcli.results.tables import to_csv, to_json
 from srfcli.validation import marks as report
 from srfcli.validation.apparatus import RIGS
 from srfcli.validation.blind import (
@@ -42,7 +43,7 @@ from srfcli.validation.cases import BANKS, NAMES, PAPER_KINDS, WIDE_KINDS, make_
 from srfcli.validation.gauge import Gauge
 from srfcli.validation.marks import INVISIBLE, Rate, Sight, accepted, calibration, deviation, mark, quantile, see, stands_out
 from srfcli.validation.slider import Physics, Plan, move
-from srfcli.validation.trials import Trial, answer_all, begin, open_truths
+from srfcli.validation.trials import Trial, answer_all, begin, open_truths, prove
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = (
@@ -640,6 +641,21 @@ def test_the_command_from_bank_to_report(stub, tmp_path, capsys):
     assert srf("prove", "--out", folder, "--resume") == 0
     assert srf("prove", "--out", folder, "--resume", "--cases", 5) == 2
     assert "is a trial of cases 4, not 5" in capsys.readouterr().err
+
+
+def test_python_has_what_the_command_prints(stub, new_trial, tmp_path, capsys):
+    folder, stages = new_trial(tmp_path / "t", 2).folder, []
+    found = prove(folder, resume=True, progress=lambda stage, text, total: stages.append((stage, total)))
+    assert stages == [("sealed", None), *[("diagnosed", 2)] * 3, *[("truth", 2)] * 3] and not (folder / "report.json").exists()
+    assert srf("prove", "--report-only", folder, "--json") == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(to_json(found.table))
+    assert srf("prove", "--report-only", folder, "--csv") == 0
+    assert capsys.readouterr().out == to_csv(found.cases) and (folder / "cases.csv").read_text() == to_csv(found.cases)
+    axes = pytest.importorskip("matplotlib.figure").Figure().subplots()
+    found.plot(ax=axes)
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert labels == [f"{row[0]}: {row[1]} of {row[2]}" for row in found.more[0].rows]
+    assert sum(row[1] for row in found.table.rows) == len(found.cases.rows) == 2
 
 
 def test_the_command_on_the_wide_bank(stub, tmp_path, monkeypatch, capsys):

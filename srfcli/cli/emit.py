@@ -128,14 +128,19 @@ class Progress:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._clear()
+
+    def _clear(self) -> None:
+        """Remove the line: the loop, or a stage of it, has ended."""
         if self._active and self._shown_at:
-            self._raw.write("\r\x1b[K")  # the line is removed when the loop ends
+            self._raw.write("\r\x1b[K")
             self._stream.flush()
 
-    def stage(self, label: str) -> None:
+    def stage(self, label: str, total: int | None = None) -> None:
         """Begin another stage of the work, with its own count and clock; does nothing where it is the current one."""
         if label != self.label:
-            self.label, self.total, self.done, self._begun = label, None, 0, time.monotonic()
+            self._clear()
+            self.label, self.total, self.done, self._begun = label, total, 0, time.monotonic()
 
     def advance(self, steps: int = 1, *, note: str = "", share: float | None = None, bound: float | None = None) -> None:
         """Count `steps` more and show it, at most ten times a second.

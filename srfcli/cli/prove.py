@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -12,13 +11,6 @@ from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
 from srfcli.cli.emit import Progress, emit
 from srfcli.cli.options import PATH, OutputOptions, plugins_option
 from srfcli.core.errors import SrfError
-from srfcli.results.provenance import Provenance, write_result
-from srfcli.results.tables import Table, to_csv, to_json, to_text
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from srfcli.validation.trials import Trial
 
 EXAMPLES = """
 srf prove --out proof                                      ten cases: a first look, some twenty minutes
@@ -57,7 +49,7 @@ TRACKS = ("smooth", "rough", "shared")
 @click.option("--workers", type=click.IntRange(0, 4096), default=1, help="Processes, 0 for all cores.")
 @click.option("--out", metavar="DIR", type=PATH, help="New folder for bank, answers and report.")
 @click.option("--resume", is_flag=True, help="Go on with the trial in --out.")
-@click.option("--report-only", "report", metavar="DIR", type=PATH, help="Diagnose nothing; mark the answers in DIR again.")
+@click.option("--report-only", metavar="DIR", type=PATH, help="Diagnose nothing; mark the answers in DIR again.")
 @click.option("--unfinished", is_flag=True, help="Give up the cases without an answer: the trial ends here.")
 @click.option(
     "--limit",
@@ -69,91 +61,38 @@ TRACKS = ("smooth", "rough", "shared")
 @plugins_option
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, in full precision.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print the marks as CSV, one case a line.")
-def command(
-    workers: int,
-    out: Path | None,
-    report: Path | None,
-    unfinished: bool,
-    limit: float,
-    plugins: tuple[Path, ...],
-    as_json: bool,
-    as_csv: bool,
-    **asked: Any,
-) -> None:
+def command(out: Path | None, report_only: Path | None, as_json: bool, as_csv: bool, **asked: Any) -> None:
     """Test the diagnosis on synthetic experiments whose truth is sealed until the last answer.
 
     Makes a bank of concealed cases by equations and a solver of its own, prints the digest of the truths, and diagnoses
     every case from its folder alone. When all are answered it verifies the seal, reads the truths, and prints what was
     right, with intervals. Each answer is kept as it comes.
     """
-    from srfcli.validation.trials import Trial
+    from srfcli.validation.trials import prove
 
     if as_json and as_csv:
         raise SrfError("--json and --csv exclude each other", "--report-only prints the other at no cost.")
-    if (out is None) == (report is None):
+    folder = report_only if out is None else out
+    if folder is None or (out is not None and report_only is not None):
         said = "neither --out nor --report-only is given" if out is None else "--out and --report-only exclude each other"
         raise SrfError(said, "srf prove --out DIR makes a trial, srf prove --report-only DIR reads one.")
-    count = workers or os.cpu_count() or 1
-    if out is not None:
-        if unfinished:
-            raise SrfError("--unfinished ends a trial that was begun", f"srf prove --report-only {out} --unfinished")
-        trial = _answered(out, asked, count, limit, plugins)
-    else:
-        assert report is not None
-        for name in ("cases", "seed", "kinds", "bank", "track", "resume"):
-            if asked[name] not in (None, ()) and asked[name] is not False:
-                raise SrfError(f"--{name.replace('kinds', 'kind')} has no meaning with --report-only", "Leave it out.")
-        trial = Trial(report)
-        trial.asked()
-    _report(trial, count, unfinished, "json" if as_json else "csv" if as_csv else "text")
-
-
-def _answered(folder: Path, asked: dict[str, Any], workers: int, limit: float, plugins: tuple[Path, ...]) -> Trial:
-    """Return the trial with an answer to every case; Ctrl-C ends the command, and what was answered is kept."""
-    from srfcli.laws.registry import load_registry
-    from srfcli.validation.trials import Trial, answer_all, begin
-
-    if asked["resume"] and not Trial(folder).note.exists():
-        raise SrfError(f"{folder}: there is no trial to go on with", "Leave --resume out to begin one.")
-    load_registry(plugins)  # a folder that is none must stop the command, not fail every case
     session = Session.current()
-    try:
-        with Progress("bank") as progress:
-            trial = begin(folder, **asked, workers=workers, told=lambda k, n: progress.advance())
-        waiting = trial.waiting()
-        session.say(f"SHA-256 of the sealed truths: {trial.digest()}")
-        with Progress("diagnosed", total=len(waiting)) as progress:
-            for answer in answer_all(trial, workers=workers, plugins=plugins, limit=60 * limit):
-                progress.advance(note=f"{answer.case} in {answer.cpu:.0f} s of CPU")
-    except KeyboardInterrupt:
-        click.echo(f"Interrupted: the answers so far are kept.\nTry: srf prove --out {folder} --resume", err=True)
-        raise click.exceptions.Exit(EXIT_INTERRUPTED) from None
-    return trial
+    with Progress("prove") as progress:
 
+        def told(stage: str, text: str, total: int | None) -> None:
+            progress.stage(stage, total)
+            if stage == "sealed":
+                session.say(text)
+            elif text:
+                progress.advance(note=text)
 
-def _report(trial: Trial, workers: int, unfinished: bool, format: str) -> None:
-    """Unseal, mark every answer, print the tables and keep them beside the answers."""
-    from srfcli.validation.marks import cases, mark, see_all, tables
-    from srfcli.validation.trials import open_truths
-
-    truths, answers = open_truths(trial, unfinished=unfinished)
-    sights = {}
-    with Progress("truth", total=len(truths)) as progress:
-        for sight in see_all(trial.bank, truths, workers=workers, kept=trial.folder / "known.jsonl"):
-            sights[sight.case] = sight
-            progress.advance(note=sight.case)
-    marks = [mark(truths[name], answers[name], sights[name]) for name in truths]
-    asked = trial.asked()
-    table, more = tables(marks, digest=trial.digest(), seed=asked["seed"], of=asked["cases"])
-    listed = cases(marks)
-    _keep(trial, asked["seed"], table, more, listed)
-    emit(listed if format == "csv" else table, OutputOptions(format), more=more)
-
-
-def _keep(trial: Trial, seed: int, table: Table, more: Sequence[Table], listed: Table) -> None:
-    """Write the report beside the answers: for a reader in few digits, for a program in all, and one line per case."""
-    text = "\n".join(to_text(t, full=False) for t in [table, *more])
-    provenance = Provenance(Session.current().arguments, inputs=(trial.answers, trial.apart), seed=seed)
-    for name, content in (("report.txt", text), ("report.json", to_json(table)), ("cases.csv", to_csv(listed))):
-        write_result(trial.folder / name, content.encode("utf-8"), provenance)
-        Session.current().say(f"Wrote {trial.folder / name}")
+        try:
+            found = prove(folder, **asked, report_only=out is None, progress=told)
+        except KeyboardInterrupt:
+            if out is None:
+                raise
+            click.echo(f"Interrupted: the answers so far are kept.\nTry: srf prove --out {out} --resume", err=True)
+            raise click.exceptions.Exit(EXIT_INTERRUPTED) from None
+    found.write(arguments=session.arguments, told=session.say)
+    format = "json" if as_json else "csv" if as_csv else "text"
+    emit(found.cases if as_csv else found.table, OutputOptions(format), more=found.more)

@@ -1,22 +1,33 @@
-"""A trial: a folder with a sealed bank of cases, the answers so far and, when all are answered, the truths."""
+"""`prove`: a trial is a folder with a sealed bank of cases, the answers so far and, when all are answered, the truths."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from srfcli.core.errors import SrfError
+from srfcli.core.errors import SrfError, check_choice
 from srfcli.core.files import clear, parse_json, read_plain, write_atomic
 from srfcli.core.parallel import run_processes
+from srfcli.laws.registry import load_registry
+from srfcli.results import plots
+from srfcli.results.provenance import Provenance, write_result
+from srfcli.results.tables import Result, Table, to_csv, to_json, to_text
+from srfcli.validation import marks as marking
 from srfcli.validation.blind import Answer, Diagnose, Task, answer_case, diagnose_case, failed, read_answers, write_answers
-from srfcli.validation.cases import SEAL, Truths, check_cases, check_kinds, make_bank, unseal
+from srfcli.validation.cases import BANKS, SEAL, TRACKS, Truths, check_cases, check_kinds, make_bank, unseal
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SCHEMA = "srf.trial/1"
 CPU_LIMIT = 1800.0  # s of CPU a case may take: six times what it should
@@ -197,3 +208,179 @@ def open_truths(trial: Trial, *, unfinished: bool = False) -> tuple[Truths, dict
         text = {"answers": digest, "answered": len(answers), "of": len(truths)}
         write_atomic(trial.opened, json.dumps(text, indent=1) + "\n")
     return {name: truths[name] for name in sorted(answers)}, answers
+
+
+# The task: a trial from its bank to its marks.
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class ProofResult(Result):
+    """The answers of a trial, marked by its truths.
+
+    Attributes
+    ----------
+    trial : Trial
+        The folder of the trial.
+    asked : mapping
+        Cases, seed, kinds, track and bank.
+    digest : str
+        SHA-256 of the truths, as it was published with the cases.
+    marks : tuple of Mark
+        Each answer with what was concealed, and whether it is right.
+    """
+
+    trial: Trial
+    asked: Mapping[str, Any]
+    digest: str
+    marks: tuple[marking.Mark, ...] = field(repr=False)
+
+    @cached_property
+    def _tables(self) -> tuple[Table, list[Table]]:
+        return marking.tables(self.marks, digest=self.digest, seed=self.asked["seed"], of=self.asked["cases"])
+
+    @property
+    def table(self) -> Table:
+        """Return what was concealed against the verdicts on it; `meta` has the marks and all other tables."""
+        return self._tables[0]
+
+    @property
+    def more(self) -> list[Table]:
+        """Return rates with intervals, and tables by effect, circumstance and strength, of confidence, errors and cost."""
+        return self._tables[1]
+
+    @cached_property
+    def cases(self) -> Table:
+        """Return a row for each case: what was concealed, what was said, and the mark."""
+        return marking.cases(self.marks)
+
+    def write(self, *, arguments: Sequence[str] = (), told: Callable[[str], None] = lambda text: None) -> None:
+        """Write the report beside the answers: for a reader in few digits, for a program in all, and one line per case."""
+        text = "\n".join(to_text(t, full=False) for t in [self.table, *self.more])
+        provenance = Provenance(tuple(arguments), inputs=(self.trial.answers, self.trial.apart), seed=self.asked["seed"])
+        for name, content in (("report.txt", text), ("report.json", to_json(self.table)), ("cases.csv", to_csv(self.cases))):
+            write_result(self.trial.folder / name, content.encode("utf-8"), provenance)
+            told(f"Wrote {self.trial.folder / name}")
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the rates of right and of wrong answers with their intervals of 95 %."""
+        rates = marking.rates(self.marks).records()
+        with plots.one_panel(ax, title=self.table.notes[0], size=(7.0, 1.0 + 0.3 * len(rates))) as (figure, axes):
+            share, low, high = ([rate[name] for rate in rates] for name in ("share", "low", "high"))
+            widths = [[s - a for s, a in zip(share, low, strict=True)], [b - s for s, b in zip(share, high, strict=True)]]
+            axes.errorbar(share, range(len(rates)), xerr=widths, fmt="o", capsize=3, color=plots.COLOURS[0])
+            named = [f"{rate['measure']}: {rate['hits']} of {rate['cases']}" for rate in rates]
+            axes.set_yticks(range(len(rates)), named)
+            axes.set(xlim=(-0.02, 1.02), xlabel="share of the cases, and 95 % intervals")
+            axes.invert_yaxis()
+        return figure
+
+
+def prove(
+    folder: Path | str,
+    *,
+    cases: int | None = None,
+    seed: int | None = None,
+    kinds: str | Sequence[str] = (),
+    bank: str | None = None,
+    track: str | None = None,
+    resume: bool = False,
+    report_only: bool = False,
+    unfinished: bool = False,
+    workers: int = 1,
+    limit: float = CPU_LIMIT / 60,
+    plugins: Sequence[str | Path] = (),
+    progress: Callable[[str, str, int | None], None] = lambda stage, text, total: None,
+) -> ProofResult:
+    """Return how often the diagnosis is right on synthetic experiments whose truth is sealed until the last answer.
+
+    The cases are made by equations and a solver of their own, and each is diagnosed from its folder alone. Each answer is kept
+    as it comes, and `resume` goes on with a trial that was interrupted.
+
+    Parameters
+    ----------
+    folder : path
+        Of the trial: a new one, or with `resume` or `report_only` one that is there.
+    cases, seed : int, optional
+        How many cases are made, and from which seed; 10 and 1 if left out.
+    kinds : str or sequence of str
+        'none', 'single', 'pair', 'outside', in the wide bank 'ageing' and 'one-run', too; all of the bank if left out.
+    bank : {'paper', 'wide'}, optional
+        The paper's apparatus, protocol and law, which is usual, or a wide choice of each.
+    track : {'smooth', 'rough', 'shared'}, optional
+        Random friction field of the cases: none, one of each run's own, one that all runs share; mixed if left out.
+    resume : bool
+        Whether a trial in the folder goes on.
+    report_only : bool
+        Whether nothing is diagnosed, and the answers in the folder are marked again.
+    unfinished : bool
+        With `report_only`: give up the cases without an answer. The trial ends with it.
+    workers : int
+        Processes, 0 for all cores.
+    limit : float
+        Minutes of CPU after which a case has failed.
+    plugins : sequence of path
+        Folders in which laws and effects are looked for, too.
+    progress : callable
+        Told the stage (bank, sealed, diagnosed, truth), what is done, nothing where the stage begins, and of how many cases. At
+        `sealed` it is told the digest of the truths.
+
+    Returns
+    -------
+    ProofResult
+        `.table` has what was concealed against the verdicts, `.more` the rates, `.cases` each case; `.write()` keeps a report.
+
+    Raises
+    ------
+    SrfError
+        For a folder that is no trial, or one of other cases; for cases, truths or answers that were changed.
+    KeyboardInterrupt
+        When it is stopped; the answers so far are kept.
+
+    References
+    ----------
+    Wilson (1927), J. Am. Stat. Assoc. 22, 209: the intervals.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> found = srf.prove("trial", cases=20, workers=0)  # doctest: +SKIP
+    >>> srf.prove("no-trial", resume=True)
+    Traceback (most recent call last):
+        ...
+    srfcli.core.errors.SrfError: no-trial: there is no trial to go on with
+    """
+    trial, places = Trial(Path(folder)), tuple(Path(p) for p in plugins)
+    kinds = [kinds] if isinstance(kinds, str) else kinds
+    check_choice("bank", bank, BANKS)
+    check_choice("track", track, tuple(TRACKS))
+    if (cases is not None and cases < 1) or (seed is not None and seed < 0) or workers < 0 or not limit > 0:
+        raise SrfError("a trial has one case or more, a seed and workers of 0 or more, and a limit above 0")
+    workers = workers or os.cpu_count() or 1
+    if report_only:
+        given = {"cases": cases, "seed": seed, "kinds": kinds or None, "bank": bank, "track": track, "resume": resume or None}
+        for name in (name for name, value in given.items() if value is not None):
+            raise SrfError(f"`{name}` has no meaning with `report_only`", "Leave it out.")
+        trial.asked()
+    else:
+        if unfinished:
+            raise SrfError("`unfinished` ends a trial that was begun", f"srf prove --report-only {folder} --unfinished")
+        if resume and not trial.note.exists():
+            raise SrfError(f"{folder}: there is no trial to go on with", "Leave `resume` out to begin one.")
+        load_registry(places)  # a folder that is none must stop the trial, not fail every case
+        begin(
+            trial.folder, cases=cases, seed=seed, kinds=kinds, track=track, bank=bank, resume=resume, workers=workers,
+            told=lambda k, n: progress("bank", f"case {k}", n),
+        )  # fmt: skip
+        waiting = trial.waiting()
+        progress("sealed", f"SHA-256 of the sealed truths: {trial.digest()}", None)
+        progress("diagnosed", "", len(waiting))
+        for answer in answer_all(trial, workers=workers, plugins=places, limit=60 * limit):
+            progress("diagnosed", f"{answer.case} in {answer.cpu:.0f} s of CPU", len(waiting))
+    truths, answers = open_truths(trial, unfinished=unfinished)
+    sights = {}
+    progress("truth", "", len(truths))
+    for sight in marking.see_all(trial.bank, truths, workers=workers, kept=trial.folder / "known.jsonl"):
+        sights[sight.case] = sight
+        progress("truth", sight.case, len(truths))
+    marks = tuple(marking.mark(truths[name], answers[name], sights[name]) for name in truths)
+    return ProofResult(trial, trial.asked(), trial.digest(), marks)
