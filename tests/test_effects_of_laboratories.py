@@ -330,7 +330,7 @@ def test_a_concealed_servo_is_found_where_it_is_asked_for(tmp_path: Path) -> Non
     truth = make_case(tmp_path / "servo", 7, effects=["load-servo"], size=0.6, rough=0.0, strengths=False)["physics"]
     found = diagnose(tmp_path / "servo", effects=["load-servo", "load-transmission"], registry=REGISTRY)
     assert (found.verdict, found.effects) == ("identified", ("load-servo",))
-    fitted = found.diagnosis.final.fit.values
+    fitted = found.diagnosis.best.fit.values
     for name, own in (("share", "servo"), ("natural", "servo_f"), ("damping", "servo_damping")):
         assert fitted[name] == pytest.approx(truth[own], rel=0.05)
 

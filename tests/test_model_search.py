@@ -120,7 +120,7 @@ def test_what_is_missing_is_named_on_rough_tracks(ageing):
     best = found.best.fit
     error = np.sqrt(np.diag(best.maximum.covariance))[best.likelihood.names.index("alpha")]
     assert abs(best.values["alpha"] - 0.03) < 3.5 * error
-    assert sum(h.gain for h in found.held) > 0
+    assert sum(h.predicted.gain for h in found.held) > 0
 
 
 def test_a_search_without_budget_ends_at_the_baseline_and_says_so(ageing, monkeypatch):

@@ -1,97 +1,74 @@
-"""From fits to a verdict, with fits that are made up: what counts as nothing, as one answer, and what held-out runs are worth."""
+"""From what was found to a verdict: what counts as nothing, as one answer, and what held-out runs are worth."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from srfcli.core.settings import Parameter
-from srfcli.diagnosis import verdict as module
-from srfcli.diagnosis.hypotheses import Hypothesis, neutral_values
+from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, neutral_values
 from srfcli.diagnosis.scores import Score
-from srfcli.diagnosis.verdict import HELD_OUT_RMS, MISSED, UNEXPLAINED, conclude, interesting
+from srfcli.diagnosis.verdict import HELD_OUT_RMS, MISSED, UNEXPLAINED, Conclusion, Model, Predicted, interesting, judge
 from srfcli.laws.registry import bundled_registry
 
 SHIPPED = bundled_registry()
 SEEN, HIDDEN = 1e-9, 1e9  # sizes that could have been seen
 
 
-def score(name, detectable, direction=(1.0, 0.0)):
+def score(name: str, detectable: float, direction: Sequence[float] = (1.0, 0.0)) -> Score:
     return Score(SHIPPED.get("effect", name), 1.0, {}, 0.0, 1.0, detectable, 0.5, np.array(direction))
 
 
-def fitted(*names, evidence, passes=True, scores=(), told=0.0):
-    hypothesis = Hypothesis(tuple(SHIPPED.get("effect", n) for n in names))
-    return SimpleNamespace(
-        hypothesis=hypothesis, name=hypothesis.name, evidence=evidence, passes=passes,
-        against=() if passes else ("a stretch of steps is off",), singles=scores, told=told, fit=None, shared=None,
-    )  # fmt: skip
+def model(*names: str, evidence: float, passes: bool = True, run: str = "", **known: Any) -> Model:
+    effects = tuple(replace(SHIPPED.get("effect", n), run=run) for n in names)
+    return Model(Hypothesis(effects), evidence, () if passes else ("a stretch of steps is off",), **known)
 
 
-def held(rms, gain=1.0, whole=True):
-    white = rms * np.where(np.arange(400) % 2, 1.0, -1.0)
-    told = SimpleNamespace(rms=rms)
-    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain, predictive=told, loud="")
+def held(rms: float, gain: float = 1.0, **known: Any) -> Predicted:
+    return Predicted("again", gain, rms, 400, **known)
 
 
-@pytest.fixture
-def concluded(monkeypatch):
-    """Return the verdict on a search that ended with some fits; `held` are the held-out runs."""
-
-    def verdict(*fits, held=(), cut_short=False):
-        monkeypatch.setattr(module, "held_out", lambda *_: tuple(held))
-        monkeypatch.setattr(module, "predictive", lambda fit, whole: fit.told)
-        monkeypatch.setattr(module, "on_the_track_of", lambda best, baseline: baseline)
-        monkeypatch.setattr(module, "at_bounds", lambda best: [])
-        monkeypatch.setattr(module, "uneven_noise", lambda fit: [])
-        monkeypatch.setattr(module, "unsteady_start", lambda search, best: [])
-        ranked = sorted(fits, key=lambda f: -f.evidence)
-        baseline = next(f for f in fits if f.name == "none")
-        monkeypatch.setattr(module, "not_the_same", lambda baseline, best: [])
-        whole = SimpleNamespace(runs=(), thresholds=(), vary=())
-        search = SimpleNamespace(
-            ranked=lambda: ranked, baseline=baseline, excluded=[], cut_short=cut_short, budget=150.0, whole=whole, on_request=[]
-        )
-        return conclude(search, whole)
-
-    return verdict
+def concluded(*models: Model, **found: Any) -> Conclusion:
+    return judge(sorted(models, key=lambda m: -m.evidence), **found)
 
 
-LOST = fitted(evidence=0.0, passes=False)
+LOST = model(evidence=0.0, passes=False)
+DRAG = model("viscous-drag", evidence=100.0)
 
 
 @pytest.mark.parametrize(
     ("evidence", "said"), [(98.0, ("identified", ("viscous-drag",))), (90.0, ("unknown", ()))], ids=["hardly", "far"]
 )
-def test_a_model_that_passes_is_taken_where_one_that_does_not_is_hardly_ahead_of_it(concluded, evidence, said):
-    found = concluded(fitted("slip-evolution", evidence=100.0, passes=False), fitted("viscous-drag", evidence=evidence), LOST)
+def test_a_model_that_passes_is_taken_where_one_that_does_not_is_hardly_ahead_of_it(evidence, said):
+    found = concluded(model("slip-evolution", evidence=100.0, passes=False), model("viscous-drag", evidence=evidence), LOST)
     assert (found.verdict, found.effects) == said
-    assert found.final is (found.best if said[1] else found.ranked[0])
+    best = "viscous-drag: nothing is left that a test finds" if said[1] else "slip-evolution: a stretch of steps is off"
+    assert found.reasons[0] == best
 
 
-@pytest.mark.parametrize("cut_short", [False, True])
-def test_a_search_that_its_budget_ended_says_so(concluded, cut_short):
-    found = concluded(fitted("viscous-drag", evidence=100.0), LOST, cut_short=cut_short)
-    assert any("budget of 150 s" in r for r in found.reasons) is cut_short
+@pytest.mark.parametrize("ended", [None, 150.0])
+def test_a_search_that_its_budget_ended_says_so(ended):
+    found = concluded(DRAG, LOST, ended=ended)
+    assert any("budget of 150 s" in r for r in found.reasons) is (ended is not None)
 
 
-def test_nothing_is_said_to_be_missing_only_where_all_that_promised_was_fitted(concluded):
+def test_nothing_is_said_to_be_missing_only_where_all_that_promised_was_fitted():
     scores = [score("viscous-drag", SEEN)]
-    assert concluded(fitted(evidence=0.0, scores=scores)).verdict == "none"
-    assert concluded(fitted(evidence=0.0, scores=scores), cut_short=True).verdict == "inconclusive"
+    assert concluded(model(evidence=0.0), scores=scores).verdict == "none"
+    assert concluded(model(evidence=0.0), scores=scores, ended=150.0).verdict == "inconclusive"
 
 
-def test_a_further_effect_that_gains_little_is_not_named(concluded):
-    pair = fitted("viscous-drag", "slip-evolution", evidence=103.0)
-    found = concluded(pair, fitted("viscous-drag", evidence=100.0), LOST)
+def test_a_further_effect_that_gains_little_is_not_named():
+    found = concluded(model("viscous-drag", "slip-evolution", evidence=103.0), DRAG, LOST)
     assert (found.verdict, found.effects) == ("identified", ("viscous-drag",))
 
 
-def test_models_that_do_equally_well_are_all_named(concluded):
-    found = concluded(fitted("slip-evolution", evidence=101.0), fitted("viscous-drag", evidence=99.0), LOST)
+def test_models_that_do_equally_well_are_all_named():
+    found = concluded(model("slip-evolution", evidence=101.0), model("viscous-drag", evidence=99.0), LOST)
     assert (found.verdict, set(found.effects)) == ("ambiguous", {"viscous-drag", "slip-evolution"})
     assert found.confidence["slip-evolution"] / found.confidence["viscous-drag"] == pytest.approx(np.exp(2.0))
     assert sum(found.confidence.values()) == pytest.approx(1)
@@ -100,10 +77,10 @@ def test_models_that_do_equally_well_are_all_named(concluded):
 @pytest.mark.parametrize(
     ("sizes", "verdict"), [((SEEN, SEEN), "none"), ((SEEN, HIDDEN), "none"), ((HIDDEN, HIDDEN), "inconclusive")]
 )
-def test_nothing_is_missing_only_where_it_could_have_been_seen(concluded, sizes, verdict):
+def test_nothing_is_missing_only_where_it_could_have_been_seen(sizes, verdict):
     scores = [score(n, size) for n, size in zip(("viscous-drag", "linker-dieterich"), sizes, strict=True)]
-    found = concluded(fitted(evidence=0.0, scores=scores))
-    assert found.verdict == verdict and found.final is found.baseline
+    found = concluded(model(evidence=0.0), scores=scores)
+    assert found.verdict == verdict and not found.effects and found.reasons[0] == "none: nothing is left that a test finds"
     assert found.detectable == {"viscous-drag": sizes[0], "linker-dieterich": sizes[1]}
 
 
@@ -115,44 +92,71 @@ def test_nothing_is_missing_only_where_it_could_have_been_seen(concluded, sizes,
         ([held(1.0, gain=-5.0)], "identified"),
         ([held(1.0, gain=-7.0)], "unknown"),
         ([held(1.0, gain=-7.0), held(1.0, gain=5.0)], "identified"),
-        ([held(1.0, whole=False)], "unknown"),
+        ([held(1.0, followed=False)], "unknown"),
+        ([held(1.0, loud="the gauge's noise is 2.00 times what the recording shows")], "unknown"),
     ],
-    ids=["predicted", "not predicted", "as well as by the baseline", "worse than by it", "well enough in all", "not followed"],
+    ids=["predicted", "not predicted", "as well as by the baseline", "worse", "well enough in all", "not followed", "loud"],
 )
-def test_held_out_runs_refuse(concluded, runs, verdict):
-    found = concluded(fitted("viscous-drag", evidence=100.0), LOST, held=runs)
+def test_held_out_runs_refuse(runs, verdict):
+    found = concluded(DRAG, LOST, held=runs)
     assert (found.verdict, found.ungated) == (verdict, "identified")
     assert ("held-out" in found.reasons[-1]) is (verdict == "unknown")
 
 
-def test_a_baseline_that_passes_is_refused_by_held_out_runs_too(concluded):
-    assert concluded(fitted(evidence=0.0, scores=[score("viscous-drag", SEEN)]), held=[held(2.0)]).verdict == "unknown"
+@pytest.mark.parametrize(
+    ("gains", "excess", "said"),
+    [((1.0, 1.0), 0.9, ""), ((1.0, 1.0), 1.1, "table has chi2 90.0"), ((-4.0, -3.0), 0.9, "worse than by the baseline")],
+)
+def test_held_out_critical_loads_refuse(gains, excess, said):
+    loads = [Predicted("table", gains[1], 3.0, 10, excess=excess)]
+    found = concluded(DRAG, LOST, held=[held(1.0, gain=gains[0])], loads=loads)
+    assert (found.verdict, found.ungated) == ("unknown" if said else "identified", "identified")
+    assert said in found.reasons[-1]
 
 
-def test_a_model_far_off_has_no_share_of_the_confidence(concluded):
-    found = concluded(fitted("viscous-drag", evidence=100.0, passes=False), LOST)
+def test_a_baseline_that_passes_is_refused_by_held_out_runs_too():
+    assert concluded(model(evidence=0.0), scores=[score("viscous-drag", SEEN)], held=[held(2.0)]).verdict == "unknown"
+
+
+def test_a_model_far_off_has_no_share_of_the_confidence():
+    found = concluded(replace(DRAG, against=("innovations are correlated",)), LOST)
     assert found.verdict == "unknown" and found.confidence["viscous-drag"] == 0.0
     assert found.confidence["unknown"] == pytest.approx(1 - MISSED) and found.confidence["missed"] == pytest.approx(MISSED)
-    sure = concluded(fitted("viscous-drag", evidence=100.0), LOST)
+    sure = concluded(DRAG, LOST)
     assert sure.confidence["unknown"] == pytest.approx(UNEXPLAINED, rel=0.05)
 
 
-def test_effects_of_one_signal_are_one_class(concluded):
+def test_effects_of_one_signal_are_one_class():
     scores = [
         score("viscous-drag", SEEN), score("slip-evolution", SEEN, (0.99, 0.1411)), score("friction-drift", SEEN, (0.0, 1.0)),
     ]  # fmt: skip
-    baseline = fitted(evidence=0.0, passes=False, scores=scores)
-    found = concluded(fitted("viscous-drag", evidence=100.0), baseline)
-    assert found.equivalent == (("viscous-drag", "slip-evolution"),)
+    assert concluded(DRAG, LOST, scores=scores).equivalent == (("viscous-drag", "slip-evolution"),)
+    apart = concluded(DRAG, model("slip-evolution", evidence=90.0), LOST, scores=scores)  # both were fitted
+    assert not apart.equivalent
 
 
-def test_an_effect_that_parameters_absorb_is_not_identifiable(concluded):
+def test_an_effect_that_parameters_absorb_is_not_identifiable():
     lost = replace(score("viscous-drag", HIDDEN), tolerance=1e-4)
-    found = concluded(fitted(evidence=0.0, scores=[lost, score("friction-drift", SEEN)]))
+    found = concluded(model(evidence=0.0), scores=[lost, score("friction-drift", SEEN)])
     assert [x.effect for x in found.not_identifiable] == ["viscous-drag"]
     assert "99.99 %" in found.not_identifiable[0].reason
-    baseline = fitted(evidence=0.0, passes=False, scores=[lost])
-    assert not concluded(fitted("viscous-drag", evidence=100.0), baseline).not_identifiable  # it is found all the same
+    assert not concluded(DRAG, LOST, scores=[lost]).not_identifiable  # it is found all the same
+
+
+def test_what_could_not_be_fitted_at_all_is_not_identifiable():
+    """One attempt may fail and another not."""
+    failed = [Excluded("viscous-drag", "it cannot be followed"), Excluded("sensor-lag", "it cannot be followed")]
+    assert concluded(DRAG, LOST, excluded=failed).not_identifiable == (failed[1],)
+
+
+def test_a_remark_is_told_under_its_verdicts():
+    remarks = [("under unknown", ("unknown",)), ("in one run", ("unknown", "in one run")), ("identified", ("identified",))]
+    unknown, whole, alone = (
+        concluded(m, LOST, remarks=remarks).reasons
+        for m in (replace(DRAG, against=("loud",)), DRAG, model("viscous-drag", evidence=100.0, run="steps"))
+    )
+    assert unknown == ("viscous-drag: loud", "under unknown", "in one run")
+    assert whole[1:] == ("identified",) and alone[1:] == ("in one run", "identified")
 
 
 def test_an_interesting_size_is_in_base_units():
@@ -167,35 +171,28 @@ def test_an_interesting_size_is_in_base_units():
 @pytest.mark.parametrize(
     ("apart", "said"), [(1e-3, ("identified", ("ruina",))), (0.5, ("ambiguous", ("ruina", "slip-evolution")))]
 )
-def test_an_effect_that_became_another_ageing_law_gives_way_to_it(concluded, apart, said):
+def test_an_effect_that_became_another_ageing_law_gives_way_to_it(apart, said):
     """Where both leave the same innovations; where they do not, either may be it."""
-    law, effect = fitted(evidence=100.0), fitted("slip-evolution", evidence=97.0)
-    law.hypothesis = Hypothesis((), "ruina")
-    law.name = law.hypothesis.name
     white = np.where(np.arange(400) % 2, 1.0, -1.0)
-    for fit, off in ((law, 0.0), (effect, apart)):
-        problem = SimpleNamespace(model=SimpleNamespace(parameters=[0] * (5 if fit is law else 6)))
-        fit.fit = SimpleNamespace(
-            maximum=SimpleNamespace(point=SimpleNamespace(runs=[SimpleNamespace(white=white + off)])),
-            likelihood=SimpleNamespace(problem=problem),
-        )
-    found = concluded(law, effect, LOST)
+    law = Model(Hypothesis((), "ruina"), 100.0, innovations=(white,), parameters=5)
+    found = concluded(law, model("slip-evolution", evidence=97.0, innovations=(white + apart,), parameters=6), LOST)
     assert (found.verdict, found.effects) == said
+    assert found.became == ({"slip-evolution": "ruina"} if len(said[1]) == 1 else {})
 
 
 @pytest.mark.parametrize(
     ("told", "said"), [(0.0, ("ambiguous", ("slip-evolution", "viscous-drag"))), (20.0, ("identified", ("viscous-drag",)))]
 )
-def test_held_out_runs_choose_between_models_that_fit_equally_well(concluded, told, said):
+def test_held_out_runs_choose_between_models_that_fit_equally_well(told, said):
     found = concluded(
-        fitted("slip-evolution", evidence=100.0, told=-30.0), fitted("viscous-drag", evidence=98.0, told=told - 30.0), LOST
+        model("slip-evolution", evidence=100.0, held_out=-30.0), model("viscous-drag", evidence=98.0, held_out=told - 30.0), LOST
     )
     assert (found.verdict, found.effects) == said
     assert found.confidence["viscous-drag"] > 0.99 * (1 - UNEXPLAINED) if told else found.confidence["slip-evolution"] > 0.5
 
 
-def test_models_that_held_out_runs_do_not_tell_apart_where_none_is_followed_are_told_apart_by_the_rest(concluded):
+def test_models_that_held_out_runs_do_not_tell_apart_where_none_is_followed_are_told_apart_by_the_rest():
     found = concluded(
-        fitted("slip-evolution", evidence=100.0, told=-np.inf), fitted("viscous-drag", evidence=90.0, told=-np.inf), LOST
+        model("slip-evolution", evidence=100.0, held_out=-np.inf), model("viscous-drag", evidence=90.0, held_out=-np.inf), LOST
     )
     assert (found.verdict, found.effects) == ("identified", ("slip-evolution",))

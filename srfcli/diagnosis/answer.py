@@ -47,9 +47,9 @@ class RunView:
 
 def run_views(diagnosis: Diagnosis) -> tuple[RunView, ...]:
     """Return every run under baseline and final model, fitted ones first."""
-    before, after = diagnosis.shown.fit.maximum.point.runs, diagnosis.final.fit.maximum.point.runs
+    before, after = diagnosis.shown.fit.maximum.point.runs, diagnosis.best.fit.maximum.point.runs
     found = [_view(b, a, False) for b, a in zip(before, after, strict=True)]
-    same = diagnosis.final is diagnosis.baseline
+    same = diagnosis.best is diagnosis.baseline
     return (*found, *(_view(h.shown, h.shown if same else h.augmented, True) for h in diagnosis.held))
 
 
@@ -77,7 +77,7 @@ def answer(
 
     `discriminating` is the run that discriminates between what is ambiguous.
     """
-    views, loads, last = run_views(diagnosis), load_views(diagnosis), diagnosis.final
+    views, loads, last = run_views(diagnosis), load_views(diagnosis), diagnosis.best
     sides = {}
     for place, (name, fitted, own) in enumerate((("baseline", diagnosis.shown, diagnosis.baseline), ("augmented", last, last))):
         values = own.fit.values
@@ -141,8 +141,8 @@ class LoadView:
 
 def load_views(diagnosis: Diagnosis) -> tuple[LoadView, ...]:
     """Return every table of critical loads under baseline and final model, fitted ones first."""
-    fitted = zip(*(f.fit.maximum.point.tables for f in (diagnosis.shown, diagnosis.final)), strict=True)
-    same = diagnosis.final is diagnosis.baseline
+    fitted = zip(*(f.fit.maximum.point.tables for f in (diagnosis.shown, diagnosis.best)), strict=True)
+    same = diagnosis.best is diagnosis.baseline
     held = ((h.baseline, h.baseline if same else h.augmented) for h in diagnosis.held_loads)
     views = []
     for sides in (*fitted, *held):
@@ -166,7 +166,7 @@ def together(views: Sequence[RunView | LoadView], place: int) -> float | None:
 def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
     """Return the arrays and tables of which figures and report are made, by name."""
     windows = {r.name: [list(w) for w in r.windows] for r in location.runs}
-    friction = [unexplained_friction(f, with_parameters=False) for f in (diagnosis.baseline, diagnosis.final)]
+    friction = [unexplained_friction(f, with_parameters=False) for f in (diagnosis.baseline, diagnosis.best)]
     runs = []
     for v in run_views(diagnosis):
         runs.append({
@@ -182,7 +182,7 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
          "chi2": list(v.chi2)}
         for v in load_views(diagnosis)
     ]  # fmt: skip
-    effects = [e for f in (*diagnosis.ranked, diagnosis.final) for e in f.hypothesis.effects]  # variants: the final model's
+    effects = [e for f in (*diagnosis.ranked, diagnosis.best) for e in f.hypothesis.effects]  # variants: the final model's
     return {
         "title": diagnosis.experiment.title,
         "about": {e.reported: e.about for e in effects},
@@ -210,8 +210,8 @@ def scan_row(row: Row) -> dict[str, Any]:
 def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return what was fitted, best evidence first; of models that are equal to the digit shown, the final one."""
     became = {name: f"it has become {law}" for name, law in diagnosis.became.items()}
-    ranked = sorted(diagnosis.ranked, key=lambda f: (-round(f.evidence, 1), f is not diagnosis.final))
-    told = {f.name for f in diagnosis.close} if diagnosis.verdict == "ambiguous" else {diagnosis.final.name}
+    ranked = sorted(diagnosis.ranked, key=lambda f: (-round(f.evidence, 1), f is not diagnosis.best))
+    told = {f.name for f in diagnosis.close} if diagnosis.verdict == "ambiguous" else {diagnosis.best.name}
     return [
         {"name": f.name, "evidence": f.evidence, "rms_over_noise": f.fit.maximum.point.rms,
          "field": 0.0 if f.fit.smooth else f.fit.values["field_amplitude"], "confidence": diagnosis.confidence.get(f.name, 0.0),
@@ -223,7 +223,7 @@ def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 def parameter_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return each parameter under both models, and the shift of the baseline's, in the final model's standard errors."""
-    before, after = parameters_of(diagnosis.shown), parameters_of(diagnosis.final)
+    before, after = parameters_of(diagnosis.shown), parameters_of(diagnosis.best)
     rows = []
     for name in dict.fromkeys([*before, *after]):
         a, b = before.get(name), after.get(name)

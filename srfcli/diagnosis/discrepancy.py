@@ -165,7 +165,7 @@ def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
         if not terms or best.evidence < least:
             continue
         held = held_out(diagnosis.baseline, best, diagnosis.experiment)
-        if at_bounds(best) or refusal(best, diagnosis.baseline, held):
+        if at_bounds(best) or refusal([h.predicted for h in held]):
             search.progress(f"{best.name} is not offered: held-out runs refuse it, or it stands at a bound")
             continue
         beside = tuple(e for e in best.hypothesis.effects if e.name not in names)
@@ -278,7 +278,7 @@ class ClosedForm:
         return {
             "form": self.text,
             "gain": self.gain,
-            "held_gain": sum(h.gain for h in self.held) if self.held else None,
+            "held_gain": sum(h.predicted.gain for h in self.held) if self.held else None,
             "terms": [t.described() for t in self.terms],
             "beside": [e.name for e in self.beside],
             "rms_over_noise": self.fitted.fit.maximum.point.rms,

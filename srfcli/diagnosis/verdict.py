@@ -1,34 +1,30 @@
-"""From what was fitted to what is said: the models that may be it, the gate of held-out runs, a verdict and its confidence."""
+"""From what was fitted to what is said: the models that may be it, the gate of held-out runs, a verdict and its confidence.
+
+`conclude` gathers what a search found; `judge` says what follows from that.
+"""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from itertools import combinations
+from typing import Any, TypeVar
 
 import numpy as np
 
+from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.groups import GAUGE_NOISE
-from srfcli.data.values import BETWEEN_SAMPLES, Experiment, Run, told_of_runs
+from srfcli.data.values import BETWEEN_SAMPLES, Experiment, told_of_runs
 from srfcli.diagnosis.goodness_of_fit import improbability, loudness, shortcomings, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, typical_sizes
 from srfcli.diagnosis.scores import Remainder, Score, own_values
 from srfcli.diagnosis.search import CLOSE, NEAR, SEARCH_RTOL, WORTH, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.state_space import (
-    NEEDED,
-    Filtered,
-    Predictive,
-    StateSpaceFit,
-    fit_state_space,
-    log_evidence,
-    maximise,
-)  # fmt: skip
+from srfcli.inference.state_space import NEEDED, Filtered, StateSpaceFit, fit_state_space, log_evidence, maximise  # fmt: skip
 
-BASELINE_VERDICTS = ("none", "inconclusive")  # verdicts whose final model is the baseline
 HELD_OUT_RMS = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
 ABSORBED_SHARE = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
 ALIKE = 0.97  # likeness of two effects' projected columns beyond which they are one class
@@ -37,6 +33,67 @@ LACKING = 40.0  # in log evidence, what a model that fails a test loses in the s
 # the likeliest shares of the last 109 sealed cases (benchmarks/calibration.py): of something else being concealed where a model
 # passed, of what is concealed being registered, or nothing, where the verdict is unknown
 UNEXPLAINED, MISSED = 0.09, 0.65
+VERDICTS = ("none", "inconclusive", "identified", "ambiguous", "unknown")
+MISSING, DOUBTFUL, UNKNOWN = VERDICTS[2:], (*VERDICTS[4:], "in one run"), VERDICTS[4:]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A fitted model as a verdict sees it: log evidence, what speaks against it, its log likelihood of what is `held_out`.
+
+    `parameters` says how many its system has.
+    """
+
+    hypothesis: Hypothesis
+    evidence: float
+    against: tuple[str, ...] = ()
+    held_out: float = 0.0
+    innovations: tuple[Array, ...] = field(default=(), repr=False, compare=False)
+    parameters: int = 0
+
+    @property
+    def name(self) -> str:
+        """Return the hypothesis' name."""
+        return self.hypothesis.name
+
+
+M = TypeVar("M", Model, Fitted)
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """How the best model predicts what is held out: its gain in log likelihood over the baseline, the rms of `size` residuals.
+
+    `followed` and `loud` are of a run: the latter says whether the model needs more gauge noise than it shows, where no run that
+    was fitted has its noise. `excess` is of critical loads: how improbable they are; above 1 it is no chance.
+    """
+
+    name: str
+    gain: float
+    rms: float
+    size: int
+    followed: bool = True
+    loud: str = ""
+    excess: float = 0.0
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """What follows from a search: a verdict, the effects that it carries, and why.
+
+    `detectable` is the size, in um, s, N, from which each effect could have been seen; `ungated` the verdict, had held-out runs
+    no say; `became` which ageing law another one became, by their names.
+    """
+
+    verdict: str
+    ungated: str
+    effects: tuple[str, ...]
+    confidence: dict[str, float]
+    not_identifiable: tuple[Excluded, ...]
+    detectable: dict[str, float]
+    equivalent: tuple[tuple[str, ...], ...]
+    reasons: tuple[str, ...]
+    became: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -52,81 +109,42 @@ class Held:
     models: tuple[Fitted, Fitted] = field(repr=False)
 
     @property
-    def run(self) -> Run:
-        """Return the run."""
-        return self.baseline.run
-
-    @property
-    def predictive(self) -> Predictive:
-        """Return how well the best model predicts it, with parameters as uncertain as its fit leaves them."""
-        return self.models[1].predictive(self.run)
-
-    @property
-    def gain(self) -> float:
-        """Return what the best model gains in log marginal likelihood."""
-        return self.predictive.log_likelihood - self.models[0].predictive(self.run).log_likelihood
-
-    @property
-    def loud(self) -> str:
-        """Return whether the best model needs more gauge noise than the run shows, where no run that was fitted has its noise."""
-        if not self.models[1].fit.likelihood.noisy_alone(self.run):
-            return ""
-        own = self.predictive.fit
-        return next((text for size, text in loudness(own.likelihood, own.maximum.point) if size > 1.0), "")
+    def predicted(self) -> Predicted:
+        """Return how the best model predicts it, with parameters as uncertain as its fit leaves them."""
+        run, white = self.baseline.run, self.augmented.white
+        before, after = (f.predictive(run) for f in self.models)
+        own, loud = after.fit, ""
+        if self.models[1].fit.likelihood.noisy_alone(run):
+            loud = next((text for size, text in loudness(own.likelihood, own.maximum.point) if size > 1.0), "")
+        gain = after.log_likelihood - before.log_likelihood
+        return Predicted(run.name, gain, after.rms, white.size, self.augmented.whole, loud)
 
 
 @dataclass(frozen=True)
 class HeldLoads:
-    """One held-out table of critical loads beside the baseline's and the best model's, as they were fitted to the rest.
-
-    `excess` says how improbable its chi2 is under the best model, the model's own errors allowed for: above 1 it is no chance.
-    """
+    """One held-out table of critical loads beside the baseline's and the best model's, as they were fitted to the rest."""
 
     baseline: Matched
     augmented: Matched
-    excess: float
-
-    @property
-    def gain(self) -> float:
-        """Return what the best model gains in log likelihood."""
-        return self.augmented.log_likelihood - self.baseline.log_likelihood
+    predicted: Predicted
 
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """Everything that is said and what it rests on; `close` are the models that may be it, best first.
+class Diagnosis(Conclusion):
+    """Everything that is said and what it rests on; `close` are the models that may be it, `best` the one that is reported.
 
-    `shown` is the baseline with the final model's field and gauge noise, its own parameters fitted again.
-    `detectable` is the size, in um, s, N, from which each effect could have been seen; `ungated` the verdict, had held-out runs
-    no say; `became` which ageing law another one became, by their names.
+    `shown` is the baseline with the best model's field and gauge noise, its own parameters fitted again.
     """
 
     experiment: Experiment
-    verdict: str
     best: Fitted
     baseline: Fitted
     shown: Fitted
     ranked: tuple[Fitted, ...]
     close: tuple[Fitted, ...]
-    confidence: dict[str, float]
     scores: tuple[Score, ...]
-    not_identifiable: tuple[Excluded, ...]
-    detectable: dict[str, float]
-    equivalent: tuple[tuple[str, ...], ...]
     held: tuple[Held, ...] = field(repr=False)
-    reasons: tuple[str, ...]
-    ungated: str
-    held_loads: tuple[HeldLoads, ...] = field(default=(), repr=False)
-    became: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Return the names that the verdict carries."""
-        if self.verdict == "identified":
-            return self.best.hypothesis.reported
-        if self.verdict == "ambiguous":
-            return tuple(dict.fromkeys(n for f in self.close for n in f.hypothesis.reported))
-        return ()
+    held_loads: tuple[HeldLoads, ...] = field(repr=False)
 
     @property
     def acts_in(self) -> dict[str, str]:
@@ -134,63 +152,77 @@ class Diagnosis:
         named = self.best.hypothesis.effects if self.verdict == "identified" else ()
         return {e.reported: e.run for e in named if e.run}
 
-    @property
-    def final(self) -> Fitted:
-        """Return the model that the answer calls augmented: the baseline itself where nothing is to be added."""
-        return self.baseline if self.verdict in BASELINE_VERDICTS else self.best
-
 
 def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     """Return the verdict on a finished search; `whole` is the experiment with its held-out runs, opened only now."""
-    ranked = tuple(search.ranked())
     own_noise = GAUGE_NOISE in set(search.whole.vary) - set(whole.vary)
-    if own_noise:
-        whole = replace(whole, vary=search.whole.vary)
-    baseline, best = search.baseline, ranked[0]
-    close, joint, became = may_be_it(ranked, whole)
-    best = close[0] if close else best
+    whole = replace(whole, vary=search.whole.vary) if own_noise else whole
+    baseline, ranked = search.baseline, tuple(search.ranked())
+    told = held_out_likelihoods(asked(ranked), whole)
+    models = [
+        Model(f.hypothesis, f.evidence, f.against, told.get(f.name, 0.0), tuple(r.white for r in f.fit.maximum.point.runs),
+              len(f.fit.likelihood.problem.model.parameters))
+        for f in ranked
+    ]  # fmt: skip
+    close = tuple(f for m in may_be_it(models)[0] for f in ranked if f.name == m.name)
+    best = close[0] if close else ranked[0]
     shown = on_the_track_of(best, baseline) if best.passes else baseline
     held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
-    scores = tuple(baseline.singles)
-    ungated, reasons = _said(best, close, scores, search.cut_short)
-    refused = refusal(best, baseline, held, held_loads) if ungated != "unknown" else ""
-    verdict = "unknown" if refused else ungated
-    if refused:
-        reasons.append(refused)
-    elif verdict == "unknown":
-        reasons += uneven_noise(best.fit) + unsteady_start(search, best)
-    doubtful = verdict == "unknown" or (verdict == "identified" and any(e.run for e in best.hypothesis.effects))
-    if doubtful:
-        reasons += not_the_same(baseline, best if verdict == "identified" else baseline)
-    if verdict not in BASELINE_VERDICTS:
-        reasons += told_of_runs(search.whole.runs, BETWEEN_SAMPLES)
-    if doubtful and search.on_request:
-        reasons.append(
-            f"not tried, as they are looked for where they are named alone: {', '.join(search.on_request)}; --effect NAME"
-        )
+    wrong = [] if best.passes else [*uneven_noise(best.fit), *unsteady_start(search, best)]
+    remarks = [*((text, UNKNOWN) for text in wrong), *not_the_same(baseline)]
+    remarks += [(text, MISSING) for text in told_of_runs(search.whole.runs, BETWEEN_SAMPLES)]
+    if search.on_request:
+        names = ", ".join(search.on_request)
+        remarks.append((f"not tried, as they are looked for where they are named alone: {names}; --effect NAME", DOUBTFUL))
     if whole.runs and not baseline.fit.likelihood.problem.runs:
-        reasons.append("held-out runs are not judged, as no run was fitted that would tell the gauge's noise")
+        remarks.append(("held-out runs are not judged, as no run was fitted that would tell the gauge's noise", VERDICTS))
     if own_noise:
-        reasons.append(f"each {whole.vary[GAUGE_NOISE]} was given a gauge noise of its own, as no one noise is that of all")
-    for fitted in (best, *(f for f in close if f is not best)):
+        said = f"each {whole.vary[GAUGE_NOISE]} was given a gauge noise of its own, as no one noise is that of all"
+        remarks.append((said, VERDICTS))
+    for fitted in close or (best,):
         for name in at_bounds(fitted):
             there = "" if name in (q.name for q in whole.parameters) else " of the augmented experiment"
-            reasons.append(f"{name} of {fitted.name} stands at its bound; [parameters]{there} can widen it")
-    if search.cut_short:
-        reasons.append(f"the search ended at its budget of {search.budget:.0f} s of CPU, with models left to fit")
-    named = {n for f in close for n in f.hypothesis.reported}  # found all the same
-    excluded = [e for e in search.excluded if e.effect not in search.fitted]  # one attempt may fail and another not
+            remarks.append((f"{name} of {fitted.name} stands at its bound; [parameters]{there} can widen it", VERDICTS))
+    judged = judge(
+        models, baseline.singles, [h.predicted for h in held if best.passes], [h.predicted for h in held_loads],
+        search.excluded, remarks, search.budget if search.cut_short else None,
+    )  # fmt: skip
+    return Diagnosis(
+        **vars(judged), experiment=whole, best=best, baseline=baseline, shown=shown, ranked=ranked, close=close,
+        scores=tuple(baseline.singles), held=held, held_loads=held_loads,
+    )  # fmt: skip
+
+
+def judge(
+    ranked: Sequence[Model], scores: Sequence[Score] = (), held: Sequence[Predicted] = (), loads: Sequence[Predicted] = (),
+    excluded: Sequence[Excluded] = (), remarks: Sequence[tuple[str, Sequence[str]]] = (), ended: float | None = None,
+) -> Conclusion:  # fmt: skip
+    """Return what follows from models, best evidence first, scores of the baseline, and how what is held out is predicted.
+
+    `remarks` are sentences, each with the verdicts under which it is told, or where what is identified acts "in one run". `ended`
+    is the budget, in s of CPU, of a search that left models to fit.
+    """
+    close, joint, became = may_be_it(ranked)
+    best = close[0] if close else ranked[0]
+    ungated, reasons = _said(best, close, scores, ended is not None)
+    refused = refusal(held, loads) if ungated != "unknown" else ""
+    verdict = "unknown" if refused else ungated
+    alone = verdict == "identified" and any(e.run for e in best.hypothesis.effects)
+    reasons += [refused] if refused else []
+    reasons += [text for text, under in remarks if verdict in under or (alone and "in one run" in under)]
+    if ended is not None:
+        reasons.append(f"the search ended at its budget of {ended:.0f} s of CPU, with models left to fit")
+    named = tuple(dict.fromkeys(n for m in close for n in m.hypothesis.reported))
+    failed = [e for e in excluded if e.effect not in joint]  # one attempt may fail and another not
     absorbed = [
         Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.tolerance):.2f} % of it")
         for s in scores
-        if s.tolerance < ABSORBED_SHARE and s.detectable > interesting(s) and s.effect.reported not in named
+        if s.tolerance < ABSORBED_SHARE and s.detectable > interesting(s) and s.effect.reported not in named  # found all the same
     ]
-    return Diagnosis(
-        whole, verdict, best, baseline, baseline if verdict in BASELINE_VERDICTS else shown, ranked, close,
-        _confidence(ranked, joint, became, verdict), scores,
-        tuple(dict.fromkeys((*excluded, *absorbed))), {s.effect.reported: s.detectable for s in scores},
-        _equivalent(scores, close, ranked, joint), held,
-        tuple(reasons), ungated, held_loads, became,
+    return Conclusion(
+        verdict, ungated, {"identified": best.hypothesis.reported, "ambiguous": named}.get(verdict, ()),
+        _confidence(ranked, joint, became, verdict), tuple(dict.fromkeys((*failed, *absorbed))),
+        {s.effect.reported: s.detectable for s in scores}, _equivalent(scores, close, ranked, joint), tuple(reasons), became,
     )  # fmt: skip
 
 
@@ -212,57 +244,68 @@ def unsteady_start(search: ModelSearch, best: Fitted) -> list[str]:
     return [said] if gain > CLOSE else []
 
 
-def not_the_same(baseline: Fitted, best: Fitted) -> list[str]:
-    """Return which parameter of the baseline differs in one run, where that gains more at first order than what was found."""
+def not_the_same(baseline: Fitted) -> list[tuple[str, Sequence[str]]]:
+    """Return which parameter of the baseline differs in one run, and where it is told.
+
+    Where an effect was found, that is only if it gains more, at first order, than any effect.
+    """
     own = next(iter(own_values(baseline.remainder)), None)
-    gains = [s.gain for s in baseline.singles] + [s.gain for s in (baseline.scores.alone if baseline.scores else ())]
-    least = max(gains, default=0.0) if best is not baseline else WORTH
-    if own is None or own.gain < max(least, WORTH):
+    if own is None or own.gain < WORTH:
         return []
+    gains = [s.gain for s in (*baseline.singles, *(baseline.scores.alone if baseline.scores else ()))]
     value, unit = baseline.fit.values[own.parameter], baseline.fit.likelihood.problem.unit_of(own.parameter)
     there, here = (f"{from_base(x, unit):.3g}{'' if unit == '1' else ' ' + unit}" for x in (value + own.change, value))
     said = f"{own.parameter} of {own.run} alone, about {there} where the baseline has {here}"
-    return [f"{said}, would gain {own.gain:.0f} in log likelihood: --vary {own.parameter}"]
+    said = f"{said}, would gain {own.gain:.0f} in log likelihood: --vary {own.parameter}"
+    return [(said, UNKNOWN if own.gain < max(gains, default=0.0) else DOUBTFUL)]
 
 
-def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted, ...], dict[str, float], dict[str, str]]:
+def asked(ranked: Sequence[M]) -> list[M]:
+    """Return the models that are asked what they say of what is held out: those that pass and are not far behind."""
+    least = ranked[0].evidence - (CLOSE if ranked[0].against else BEHIND)
+    return [m for m in ranked if not m.against and m.evidence > least]
+
+
+def may_be_it(ranked: Sequence[Model]) -> tuple[tuple[Model, ...], dict[str, float], dict[str, str]]:
     """Return the models that pass and may be it, best first, and the log evidence of each model on all runs together.
 
     That is its evidence on the runs fitted and its likelihood of the runs held out, for those that pass; the others are given
     the same likelihood as the best of these. Of two that come close one that holds the other gives way, and one that
     became the other; of an effect in all runs or in one, that which is worse. The third is which became which, by name.
     """
-    least = ranked[0].evidence - (BEHIND if ranked[0].passes else CLOSE)
-    passed = [f for f in ranked if f.passes and f.evidence > least]
-    told = {f.name: predictive(f, whole) for f in passed}
-    under = [f for f in passed if f.shared is not None]
-    if 0 < len(under) < len(passed):  # what is a function of slip tells a held-out run on the same track, as a field there would
-        gain = shared_gain(max(under, key=lambda f: f.separate), whole)
-        told |= {f.name: told[f.name] + gain for f in under}
+    passed = asked(ranked)
+    told = {m.name: m.held_out for m in passed}
     if not any(np.isfinite(t) for t in told.values()):  # no model follows what is held out
         told = {}
-    passed.sort(key=lambda f: -f.evidence - told.get(f.name, 0.0))
+    passed.sort(key=lambda m: -m.evidence - told.get(m.name, 0.0))
     rest = told.get(passed[0].name, 0.0) if passed else 0.0
-    joint = {f.name: f.evidence + told.get(f.name, rest) for f in ranked}
-    close = [f for f in passed if joint[passed[0].name] - joint[f.name] < CLOSE]
-    names = [set(f.hypothesis.reported) for f in close]
-    close = [f for f, own in zip(close, names, strict=True) if not any(n < own for n in names)]
-    best: dict[frozenset[str], Fitted] = {}
-    for f in close:
-        best.setdefault(frozenset(f.hypothesis.reported), f)
+    joint = {m.name: m.evidence + told.get(m.name, rest) for m in ranked}
+    close = [m for m in passed if joint[passed[0].name] - joint[m.name] < CLOSE]
+    names = [set(m.hypothesis.reported) for m in close]
+    close = [m for m, own in zip(close, names, strict=True) if not any(n < own for n in names)]
+    best: dict[frozenset[str], Model] = {}
+    for m in close:
+        best.setdefault(frozenset(m.hypothesis.reported), m)
     became = {}
-    for f in close:
-        laws = [other for other in close if _is_that_law(f, other, joint)]
+    for m in close:
+        laws = [other for other in close if _is_that_law(m, other, joint)]
         if laws:
-            became[f.name] = min(laws, key=_count_of_parameters).name
-    return tuple(f for f in best.values() if f.name not in became), joint, became
+            became[m.name] = min(laws, key=lambda law: law.parameters).name
+    return tuple(m for m in best.values() if m.name not in became), joint, became
 
 
-def predictive(fitted: Fitted, whole: Experiment) -> float:
-    """Return the log likelihood of all that is held out, with the model's parameters as uncertain as its fit leaves them."""
-    own = fitted.fit.likelihood
-    runs = sum(fitted.predictive(run).log_likelihood for run in whole.runs if run.holdout and own.problem.runs)
-    return runs + sum(own.held_out_table(t, fitted.fit.values).log_likelihood for t in whole.thresholds if t.holdout)
+def held_out_likelihoods(fits: Sequence[Fitted], whole: Experiment) -> dict[str, float]:
+    """Return the log likelihood of all that is held out, by each model, its parameters as uncertain as its fit leaves them."""
+    told = {}
+    for f in fits:
+        own = f.fit.likelihood
+        told[f.name] = sum(f.predictive(run).log_likelihood for run in whole.runs if run.holdout and own.problem.runs)
+        told[f.name] += sum(own.held_out_table(t, f.fit.values).log_likelihood for t in whole.thresholds if t.holdout)
+    under = [f for f in fits if f.shared is not None]
+    if 0 < len(under) < len(fits):  # what is a function of slip tells a held-out run on the same track, as a field there would
+        gain = shared_gain(max(under, key=lambda f: f.separate), whole)
+        told |= {f.name: told[f.name] + gain for f in under}
+    return told
 
 
 def shared_gain(fitted: Fitted, whole: Experiment) -> float:
@@ -276,23 +319,18 @@ def shared_gain(fitted: Fitted, whole: Experiment) -> float:
     return total
 
 
-def _count_of_parameters(fitted: Fitted) -> int:
-    return len(fitted.fit.likelihood.problem.model.parameters)
-
-
-def _is_that_law(fitted: Fitted, other: Fitted, evidence: Mapping[str, float]) -> bool:
+def _is_that_law(model: Model, other: Model, evidence: Mapping[str, float]) -> bool:
     """Return whether a model became what another ageing law is that has fewer parameters: the innovations are the same.
 
     Either without effects or beside the same ones.
     """
     beside = other.hypothesis.reported[1:]
-    if not other.hypothesis.ageing or other is fitted or (beside and beside != fitted.hypothesis.reported[1:]):
+    if not other.hypothesis.ageing or other is model or (beside and beside != model.hypothesis.reported[1:]):
         return False
-    more, less = (_count_of_parameters(f) for f in (fitted, other))
-    if more <= less or evidence[fitted.name] - evidence[other.name] > NEEDED:
+    if model.parameters <= other.parameters or evidence[model.name] - evidence[other.name] > NEEDED:
         return False
-    whites = zip(fitted.fit.maximum.point.runs, other.fit.maximum.point.runs, strict=True)
-    return float(sum(np.sum((a.white - b.white) ** 2) for a, b in whites)) < 2 * CLOSE
+    whites = zip(model.innovations, other.innovations, strict=True)
+    return float(sum(np.sum((a - b) ** 2) for a, b in whites)) < 2 * CLOSE
 
 
 def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
@@ -316,11 +354,9 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
     if not baseline.fit.likelihood.problem.runs:
         return ()  # of a gauge that nothing was fitted to
     models = (baseline, best, shown or baseline)
-    found = []
-    for run in (run for run in whole.runs if run.holdout):
-        first, last, seen = (f.fit.likelihood.held_out(run, f.fit.values) for f in models)
-        found.append(Held(first, last, seen, (baseline, best)))
-    return tuple(found)
+    runs = (run for run in whole.runs if run.holdout)
+    sides = ([f.fit.likelihood.held_out(run, f.fit.values) for f in models] for run in runs)
+    return tuple(Held(first, last, seen, (baseline, best)) for first, last, seen in sides)
 
 
 def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[HeldLoads, ...]:
@@ -330,27 +366,29 @@ def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[H
         before, after = (f.fit.likelihood.held_out_table(loads, f.fit.values) for f in (baseline, best))
         spread = np.eye(after.white.size) + after.slopes @ best.fit.covariance @ after.slopes.T
         cost = float(after.white @ np.linalg.solve(spread, after.white))
-        found.append(HeldLoads(before, after, improbability(cost, after.white.size)))
+        gain, size = after.log_likelihood - before.log_likelihood, after.white.size
+        rms, excess = float(np.sqrt(after.match.cost / size)), improbability(cost, size)
+        found.append(HeldLoads(before, after, Predicted(loads.name, gain, rms, size, excess=excess)))
     return tuple(found)
 
 
-def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score], cut_short: bool) -> tuple[str, list[str]]:
-    if not best.passes:
+def _said(best: Model, close: Sequence[Model], scores: Sequence[Score], cut_short: bool) -> tuple[str, list[str]]:
+    if best.against:
         return "unknown", [f"{best.name}: {reason}" for reason in best.against]
     reasons = [f"{best.name}: nothing is left that a test finds"]
-    if any(not f.hypothesis.reported for f in close):
+    if not best.hypothesis.reported:
         if cut_short:
             return "inconclusive", [*reasons, "models that may explain more were not fitted"]
         seen = [s for s in scores if s.detectable < interesting(s)]
         if 2 * len(seen) >= len(scores):
             return "none", [*reasons, "the baseline explains the recordings"]
         return "inconclusive", [*reasons, "nothing is needed, and most effects of interesting size could not have been seen"]
-    if len({frozenset(f.hypothesis.reported) for f in close}) > 1:
-        return "ambiguous", [*reasons, "several models do equally well: " + ", ".join(f.name for f in close)]
+    if len(close) > 1:
+        return "ambiguous", [*reasons, "several models do equally well: " + ", ".join(m.name for m in close)]
     return "identified", reasons
 
 
-def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequence[HeldLoads] = ()) -> str:
+def refusal(runs: Sequence[Predicted], loads: Sequence[Predicted] = ()) -> str:
     """Return why held-out runs and critical loads refuse the best model; nothing where they do not.
 
     Were a model true, another one would predict new data better by CLOSE in log likelihood in at most exp(-CLOSE) of cases, as
@@ -358,23 +396,21 @@ def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequenc
     """
     for table in loads:
         if table.excess > 1.0:
-            name, chi2 = table.augmented.loads.name, table.augmented.match.cost
-            return f"held-out critical loads are not predicted: {name} has chi2 {chi2:.1f}"
-    more = sum(h.gain for h in held) + sum(h.gain for h in loads)
-    if loads and best is not baseline and more < -CLOSE:
+            return f"held-out critical loads are not predicted: {table.name} has chi2 {table.size * table.rms**2:.1f}"
+    more = sum(r.gain for r in runs) + sum(t.gain for t in loads)
+    if loads and more < -CLOSE:
         return f"what is held out is predicted worse than by the baseline: log likelihood {more:+.1f}"
-    if not held:
+    if not runs:
         return ""
-    if not all(h.augmented.whole for h in held):
+    if not all(r.followed for r in runs):
         return "held-out runs cannot be followed"
-    if loud := next((f"what is left in {h.run.name} as noise, {h.loud}" for h in held if h.loud), ""):
+    if loud := next((f"what is left in {r.name} as noise, {r.loud}" for r in runs if r.loud), ""):
         return f"held-out runs are not predicted: with {loud}"
-    sizes, levels = [h.augmented.white.size for h in held], [h.predictive.rms for h in held]
-    rms = float(np.sqrt(np.average(np.square(levels), weights=sizes)))
+    rms = float(np.sqrt(np.average([r.rms**2 for r in runs], weights=[r.size for r in runs])))
     if not rms < HELD_OUT_RMS:
         return f"held-out runs are not predicted: innovations have an rms of {rms:.3f} with the parameters moved as they may"
-    gain = sum(h.gain for h in held)
-    if best is not baseline and gain < -CLOSE:
+    gain = sum(r.gain for r in runs)
+    if gain < -CLOSE:
         return f"held-out runs are predicted worse than by the baseline: log likelihood {gain:+.1f}"
     return ""
 
@@ -392,39 +428,34 @@ def at_bounds(fitted: Fitted) -> list[str]:
 
 
 def _equivalent(
-    scores: Sequence[Score], close: Sequence[Fitted], ranked: Sequence[Fitted], joint: Mapping[str, float]
+    scores: Sequence[Score], close: Sequence[Model], ranked: Sequence[Model], joint: Mapping[str, float]
 ) -> tuple[tuple[str, ...], ...]:
     """Return the pairs of effects whose signals no parameter change tells apart, and that matter here.
 
     First-order signals do not count where both were fitted and their log evidence tells them apart.
     """
-    names = {n for f in close for n in f.hypothesis.reported}
-    fitted = {frozenset(f.hypothesis.reported): joint[f.name] for f in reversed(ranked)}  # the best of each
+    names = {n for m in close for n in m.hypothesis.reported}
+    fitted = {frozenset(m.hypothesis.reported): joint[m.name] for m in reversed(ranked)}  # the best of each
 
     def apart(one: str, other: str) -> bool:
-        for own in (set(f.hypothesis.reported) for f in close if one in f.hypothesis.reported):
-            if fitted[frozenset(own)] - fitted.get(frozenset(own - {one} | {other}), np.inf) > CLOSE:
-                return True
-        return False
+        sets = [set(m.hypothesis.reported) for m in close if one in m.hypothesis.reported]
+        return any(fitted[frozenset(s)] - fitted.get(frozenset(s - {one} | {other}), np.inf) > CLOSE for s in sets)
 
     found = []
-    for i, a in enumerate(scores):
-        for b in scores[i + 1 :]:
-            one, other = a.effect.reported, b.effect.reported
-            alike = ({one, other} & names or not names) and abs(float(a.direction @ b.direction)) > ALIKE
-            if alike and not (apart(one, other) or apart(other, one)):
-                found.append((one, other))
+    for a, b in combinations(scores, 2):
+        one, other = a.effect.reported, b.effect.reported
+        alike = ({one, other} & names or not names) and abs(float(a.direction @ b.direction)) > ALIKE
+        if alike and not (apart(one, other) or apart(other, one)):
+            found.append((one, other))
     return tuple(found)
 
 
-def _confidence(
-    ranked: Sequence[Fitted], joint: Mapping[str, float], became: Mapping[str, str], verdict: str
-) -> dict[str, float]:
+def _confidence(ranked: Sequence[Model], joint: Mapping[str, float], became: Mapping[str, str], verdict: str) -> dict[str, float]:
     """Return the stated confidence in each model, by evidence, in `unknown`, in what the search `missed` where none passes.
 
     A model that became another law is that law.
     """
-    weights = {f.name: joint[f.name] - (0.0 if f.passes else LACKING) for f in ranked}
+    weights = {m.name: joint[m.name] - (LACKING if m.against else 0.0) for m in ranked}
     top = max(weights.values())
     share = {name: float(np.exp(max(w - top, -60.0))) for name, w in weights.items()}
     total, unknown = sum(share.values()), 1 - MISSED if verdict == "unknown" else UNEXPLAINED
@@ -433,7 +464,7 @@ def _confidence(
             law = became[law]
         share[law] += share[name]
         share[name] = 0.0
-    passed = any(f.passes for f in ranked)  # else none of them is it
+    passed = any(not m.against for m in ranked)  # else none of them is it
     found = {name: (1 - unknown) * v / total if passed else 0.0 for name, v in share.items()}
     found |= {"unknown": unknown} | ({} if passed else {"missed": 1 - unknown})
     return dict(sorted(found.items(), key=lambda item: -item[1]))

@@ -121,7 +121,7 @@ class DiagnosisResult(Result):
         named = [f"{name} in {alone[name]} alone" if name in alone else name for name in self.effects]
         if self.verdict == "identified":
             named = [f"the ageing law is {name}, not {stated}" if name in laws else name for name in named]
-        bounds = at_bounds(self.diagnosis.final)
+        bounds = at_bounds(self.diagnosis.best)
         beside = f"; {', '.join(bounds)} at {'its bound' if len(bounds) == 1 else 'their bounds'}" if bounds else ""
         return SENTENCES[self.verdict].format(" and ".join(named)) + beside
 
@@ -291,7 +291,7 @@ class DiagnosisResult(Result):
         from srfcli.diagnosis.augment import augment
         from srfcli.diagnosis.diagram import as_fitted, stability
 
-        folder, diagnosis, last, found = Path(folder), self.diagnosis, self.diagnosis.final, self.answer
+        folder, diagnosis, last, found = Path(folder), self.diagnosis, self.diagnosis.best, self.answer
         with whole_folder(folder, lambda: check_answer(folder, force=force)) as fresh:  # an hour may have passed
             text = (json_text(found, indent=2) + "\n").encode("utf-8")
             made = Provenance(

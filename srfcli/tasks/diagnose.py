@@ -134,7 +134,7 @@ def diagnose(
     told("held-out runs")
     diagnosis = conclude(search, read(holdout=True))
     told("location")
-    last = diagnosis.final if diagnosis.final is not diagnosis.baseline and diagnosis.final.passes else None
+    last = diagnosis.best if diagnosis.best is not diagnosis.baseline and diagnosis.best.passes else None
     location = locate(diagnosis.baseline, last=last, seed=seed)
     form, missing, discriminating, ended = None, {}, None, False
     verdict = "" if stopped or fitted.thresholds else diagnosis.verdict

@@ -187,8 +187,8 @@ def told(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
         confidence,
         tuple(tuple(names) for names in diagnosis.equivalent),
         tuple(dict.fromkeys(x.effect for x in diagnosis.not_identifiable)),
-        {name: {k: _finite(v) for k, v in value.items()} for name, value in added(diagnosis.final, diagnosis.baseline).items()},
-        {"baseline": _finite(diagnosis.shown.fit.maximum.point.rms), "augmented": _finite(diagnosis.final.fit.maximum.point.rms)},
+        {name: {k: _finite(v) for k, v in value.items()} for name, value in added(diagnosis.best, diagnosis.baseline).items()},
+        {"baseline": _finite(diagnosis.shown.fit.maximum.point.rms), "augmented": _finite(diagnosis.best.fit.maximum.point.rms)},
         {view.run.name: _errors(view) for view in views if view.holdout},
         {_plain(f.name): _evidence(f) for f in reversed(diagnosis.ranked)},
         diagnosis.ungated,
@@ -206,7 +206,7 @@ def _critical_loads(diagnosis: Diagnosis, registry: Registry) -> Mapping[str, Se
     V = np.array([x * (slowest if x < 1 else fastest) for x in OFF_RANGE])
     try:
         found = {name: critical_loads(registry, f, V) for name, f in
-                 (("baseline", diagnosis.baseline), ("augmented", diagnosis.final))}  # fmt: skip
+                 (("baseline", diagnosis.baseline), ("augmented", diagnosis.best))}  # fmt: skip
     except SrfError:
         return {}
     return {name: [_finite(x) for x in values.tolist()] for name, values in {"V": V, **found}.items()}
