@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import os
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -61,8 +65,8 @@ def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def _hide_matplotlib(patch: pytest.MonkeyPatch) -> None:
     import importlib.util
 
-    find, place = importlib.util.find_spec, "srfcli.results.report.importlib.util.find_spec"
-    patch.setattr(place, lambda name: None if name == "matplotlib" else find(name))
+    find = importlib.util.find_spec
+    patch.setattr(importlib.util, "find_spec", lambda name, *of: None if name == "matplotlib" else find(name, *of))
 
 
 @pytest.fixture
@@ -77,6 +81,40 @@ def without_figures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         _hide_matplotlib(patch)
         yield
+
+
+class Terminal(io.StringIO):
+    """A terminal at which something ends the program, Ctrl-C as a rule, when it shows a text."""
+
+    def __init__(self, text: str, end: BaseException) -> None:
+        super().__init__()
+        self.text, self.end = text, end
+
+    def isatty(self) -> bool:
+        return True
+
+    def write(self, shown: str) -> int:
+        if self.text and self.text in shown:
+            self.text = ""
+            raise self.end
+        return super().write(shown)
+
+
+@pytest.fixture
+def srf_ended_at(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """`srf_ended_at(text, *arguments)`: exit code, stdout and stderr where Ctrl-C is pressed as progress says `text`."""
+    from srfcli.cli.main import cli
+
+    def run(text: str, *arguments: object, end: BaseException | None = None) -> tuple[int, str, str]:
+        terminal = Terminal(text, end or KeyboardInterrupt())
+        with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
+            patch.setattr(sys, "stderr", terminal)
+            patch.setattr(time, "monotonic", itertools.count(1.0).__next__)  # so slow a program shows each line
+            cli.main([str(a) for a in arguments], prog_name="srf")
+        assert not terminal.text, f"{text} was never shown"
+        return int(stop.value.code or 0), capsys.readouterr().out, terminal.getvalue()
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import srfcli
 from srfcli.cli.main import cli
 from srfcli.tasks.recordings import fit_campaign
 
+Ended = Callable[..., tuple[int, str, str]]
 pytestmark = pytest.mark.usefixtures("empty_folder")
 TRUE = {"A": 0.009, "B": 0.006, "D0": 6.0}
 K, LOAD = 4e-3, 20.0  # 1/um, MPa
@@ -124,29 +126,16 @@ def _is(text: str) -> bool:
     return True
 
 
-def test_finished_rows_are_kept_when_it_is_interrupted_and_gone_on_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_finished_rows_are_kept_when_it_is_interrupted_and_gone_on_from(srf_ended_at: Ended) -> None:
     for seed, name in enumerate(("one", "two", "three")):
         experiment(name, seed=seed)
-    asked: list[str] = []
-    import srfcli.tasks.recordings as campaign
-
-    real = campaign.fit_one
-
-    def stopped_at_the_third(task: campaign.Task) -> object:
-        asked.append(task.path)
-        if len(asked) == 3:
-            raise KeyboardInterrupt
-        return real(task)
-
-    monkeypatch.setattr(campaign, "fit_one", stopped_at_the_third)
     arguments = ("fit", "one", "two", "three", "--table", "out.csv", "--track", "smooth", "--resume", "parts")
-    done = srf(*arguments, code=130)
-    assert "the rows that were done are kept" in done.stderr and "2 of 3 experiments were done" in done.stdout
-    before = rows_of(Path("out.csv"))
-    assert list(before) == ["one", "two"]
-    asked.append("and on")  # so that nothing stops it now
+    code, out, err = srf_ended_at("2 of 3 experiments", *arguments)
+    assert code == 130 and "the rows that were done are kept" in err and "2 of 3 experiments were done" in out
+    before, kept = rows_of(Path("out.csv")), {p: p.stat().st_mtime_ns for p in Path("parts").glob("part-*")}
+    assert list(before) == ["one", "two"] and len(kept) == 2
     srf(*arguments)
-    assert asked == ["one", "two", "three", "and on", "three"]
+    assert {p: p.stat().st_mtime_ns for p in kept} == kept and len(list(Path("parts").glob("part-*"))) == 3
     after = rows_of(Path("out.csv"))
     assert list(after) == ["one", "two", "three"] and {k: after[k] for k in before} == before
 

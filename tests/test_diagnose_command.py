@@ -7,7 +7,7 @@ import os
 import re
 import shlex
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,11 @@ from click.testing import CliRunner, Result
 
 import srfcli
 from srfcli.cli.main import cli
-from srfcli.diagnosis.search import Fitted, ModelSearch
+from srfcli.core.errors import SrfError
 from srfcli.diagnosis.verdict import UNEXPLAINED
 from srfcli.results.diagnosis import prediction_names
 
+Ended = Callable[..., tuple[int, str, str]]
 ALPHA = 0.03
 TOML = """format = "srf-experiment/1"
 title = "made"
@@ -218,49 +219,30 @@ def test_where_every_run_is_held_out_there_is_nothing_to_fit(experiment: Path, t
     assert "every run is held out" in srf("diagnose", copy, code=2).stderr
 
 
-def test_held_out_files_are_opened_when_the_models_are_final(
-    experiment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_held_out_files_are_opened_when_the_models_are_final(experiment: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(experiment, copy)
     description = tomli.loads((copy / "experiment.toml").read_text())
     (held,) = (r["file"] for r in description["runs"] if r["holdout"])
     (copy / held).unlink()
-    finished = []
-    whole = ModelSearch.run
-
-    def run(self: ModelSearch) -> Fitted:
-        found = whole(self)
-        finished.append([f.name for f in self.ranked()])
-        return found
-
-    monkeypatch.setattr(ModelSearch, "run", run)
-    done = srf("diagnose", copy, *EFFECTS, "--out", tmp_path / "out", code=2)
-    assert held in done.stderr and finished and finished[0][0] == "linker-dieterich"
-    assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".*.part"))
+    told: list[str] = []
+    with pytest.raises(SrfError, match=held):
+        srfcli.diagnose(copy, effects=EFFECTS[1::2], progress=lambda text, share: told.append(text))
+    fitted = [text.partition(": log evidence")[0] for text in told if ": log evidence" in text]
+    assert told[-1] == "held-out runs" and {"none", "linker-dieterich"} <= set(fitted)
 
 
 @pytest.mark.usefixtures("without_matplotlib")
-def test_interrupted_it_keeps_what_it_has(experiment: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def expand(self: ModelSearch, node: Fitted) -> Fitted:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(ModelSearch, "_expand", expand)
-    done = srf("diagnose", experiment, *EFFECTS, "--json", "--out", tmp_path / "out", code=130)
-    found = json.loads(done.stdout)
-    assert found["status"] == "interrupted" and found["effects"] == []
+def test_interrupted_it_keeps_what_it_has(experiment: Path, srf_ended_at: Ended, tmp_path: Path) -> None:
+    code, out, _ = srf_ended_at("linker-dieterich", "diagnose", experiment, *EFFECTS, "--json", "--out", tmp_path / "out")
+    found = json.loads(out)
+    assert code == 130 and found["status"] == "interrupted" and found["effects"] == []
     assert (tmp_path / "out" / "augmented" / "experiment.toml").is_file()
 
 
-def test_interrupted_before_there_is_anything_it_writes_nothing(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def fit(self: ModelSearch, move: object) -> Fitted:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(ModelSearch, "fit", fit)
-    done = srf("diagnose", experiment, "--json", "--out", tmp_path / "out", code=130)
-    assert done.stdout == "" and not (tmp_path / "out").exists()
+def test_interrupted_before_there_is_anything_it_writes_nothing(experiment: Path, srf_ended_at: Ended, tmp_path: Path) -> None:
+    code, out, err = srf_ended_at("baseline", "diagnose", experiment, "--json", "--out", tmp_path / "out")
+    assert (code, out) == (130, "") and "before the baseline was fitted" in err and not (tmp_path / "out").exists()
 
 
 @pytest.mark.usefixtures("without_matplotlib")

@@ -433,22 +433,13 @@ def test_misuse_of_the_command(fit_command: Any, arguments: tuple[str, ...], tex
     assert done.exit_code == 2 and text in done.stderr and "\nTry: " in done.stderr
 
 
-def test_exit_codes_of_unfinished_fits(fit_command: Any, small: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from srfcli.cli.emit import Progress
-
+def test_exit_codes_of_unfinished_fits(fit_command: Any, small: Any, srf_ended_at: Any) -> None:
     Path("loads.csv").write_text(thresholds_csv(small), encoding="utf-8")
     arguments = ["loads.csv", "--free", "A,lambda", "--set", "rho=0.43", "--set", "A=0.0125", "--csv"]
     done = fit_command(*arguments, "--max-evaluations", "2")
     assert done.exit_code == 3 and "least-squares,lambda" in done.stdout and "raise --max-evaluations" in done.stderr
-
-    def interrupt(self: Any, steps: int = 1, *, note: str = "") -> None:
-        self.done += steps
-        if self.done == 3:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(Progress, "advance", interrupt)
-    done = fit_command(*arguments)
-    assert done.exit_code == 130 and "powell,lambda" in done.stdout and "least-squares" not in done.stdout
+    code, out, _ = srf_ended_at("evaluation 3", "fit", *arguments)
+    assert code == 130 and "powell,lambda" in out and "least-squares" not in out
 
 
 # intervals

@@ -183,17 +183,11 @@ def test_the_form_is_offered_as_an_effect(age):
         pytest.param(RuntimeError, 0, "RuntimeError: no", marks=pytest.mark.slow),
     ],
 )
-def test_a_verdict_outlives_its_explanation(age, tmp_path, monkeypatch, without_figures, end, code, said):
+def test_a_verdict_outlives_its_explanation(age, tmp_path, srf_ended_at, without_figures, end, code, said):
     """Where the search for a closed form is interrupted, or fails, verdict and missing force are written all the same."""
-
-    def ends(search, diagnosis):
-        raise end("no")
-
-    monkeypatch.setattr("srfcli.tasks.diagnose.best_form", ends)
-    out = tmp_path / "found"
-    result = CliRunner().invoke(cli, ["diagnose", str(age.parent), "--effect", "sensor-lag", "--out", str(out)])
-    assert result.exit_code == code, result.output
-    assert "unknown" in result.output and said in " ".join(result.output.split())
+    arguments, out = ("diagnose", age.parent, "--effect", "sensor-lag"), tmp_path / "found"
+    found, printed, _ = srf_ended_at("unknown: what is missing", *arguments, "--out", out, end=end("no"))
+    assert found == code and "unknown" in printed and said in " ".join(printed.split())
     found = json.loads((out / "answer.json").read_text())
     assert found["verdict"] == "unknown" and not found["missing"]["searched"] and found["missing"]["form"] is None
     assert (out / "missing-steps.csv").exists()

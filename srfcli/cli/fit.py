@@ -197,6 +197,7 @@ def _fit_campaign(
         inputs=[p for p in (s / "experiment.toml" if s.is_dir() else s for s in sources) if p.is_file()],
     )  # fmt: skip
     if target is not None and found.rows:
+        write_atomic(target, render(found.table, "csv").encode("utf-8"))  # all that is done, wherever it was interrupted
         Session.current().say(f"Wrote {target}")
     failed = [str(row["experiment"]) for row in found.rows if row["status"] == "failed"]
     advice = {
