@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import tomli
 
 from srfcli.core.errors import SrfError
 from srfcli.core.parallel import run_processes
@@ -65,7 +66,9 @@ def all_endless(folder):
 
 
 def says_none(folder, plugins):
-    return Answer("", "none", confidence={"none": 0.95, "unknown": 0.05}, held={"wave": {"augmented": 0.02, "baseline": 0.02}})
+    runs = tomli.loads((folder / "experiment.toml").read_text())["runs"]
+    held = {run["name"]: {"augmented": 0.02, "baseline": 0.02} for run in runs if run.get("holdout")}
+    return Answer("", "none", confidence={"none": 0.95, "unknown": 0.05}, held=held)
 
 
 def careless(folder, plugins):

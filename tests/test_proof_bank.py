@@ -61,16 +61,8 @@ def rms(x):
     return float(np.sqrt(np.mean(np.square(x))))
 
 
-def shorten(patch):
-    """Let cases have two short runs, one held out."""
-    plans = (SHORT[1], replace(SHORT[0], holdout=True))
-    patch.setattr("srfcli.validation.cases.draw_protocol", lambda rng: plans)
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """Cases of two short runs, one held out."""
-    shorten(monkeypatch)
+QUICK = {"plans": (SHORT[1], replace(SHORT[0], holdout=True))}  # two short runs, one held out
+SHORTEST = 2  # seed of three cases of the wide bank whose runs cost least
 
 
 def contents(folder):
@@ -81,8 +73,8 @@ def contents(folder):
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow if i % 3 else ()) for i, n in enumerate((None, *NAMES, *OUTSIDE_NAMES))]
 )
-def test_every_case_reads_back_and_gives_nothing_away(quick, tmp_path, name):
-    truth = make_case(tmp_path / "c", 7, effects=[name] if name else [], size=0.8, rough=False, strengths=False)
+def test_every_case_reads_back_and_gives_nothing_away(tmp_path, name):
+    truth = make_case(tmp_path / "c", 7, **QUICK, effects=[name] if name else [], size=0.8, rough=False, strengths=False)
     experiment = read_experiment(tmp_path / "c", registry=load_registry())
     p, baseline = known_physics(truth), known_physics(truth, baseline=True)
     assert truth["verdict"] == ("none" if not name else "identified" if name in NAMES else "unknown")
@@ -104,15 +96,15 @@ def test_every_case_reads_back_and_gives_nothing_away(quick, tmp_path, name):
     assert not [n for n in (*NAMES, *OUTSIDE_NAMES, "effect", "rough", "seed") if n != "inertia" and n in text]
 
 
-def test_same_seed_same_bytes(quick, tmp_path):
-    truths = [make_case(tmp_path / n, s, kind="pair") for n, s in (("a", 3), ("b", 3), ("c", 4))]
+def test_same_seed_same_bytes(tmp_path):
+    truths = [make_case(tmp_path / n, s, kind="pair", **QUICK) for n, s in (("a", 3), ("b", 3), ("c", 4))]
     a, b, c = (contents(tmp_path / n) for n in "abc")
     assert (a, json.dumps(truths[0])) == (b, json.dumps(truths[1]))
     assert a["steps.csv"] != c["steps.csv"]
 
 
-def test_strength_is_the_distance_moved(quick, tmp_path):
-    truth = make_case(tmp_path / "c", 11, effects=["viscous-drag", "friction-drift"], size=0.9, rough=3e-4)
+def test_strength_is_the_distance_moved(tmp_path):
+    truth = make_case(tmp_path / "c", 11, **QUICK, effects=["viscous-drag", "friction-drift"], size=0.9, rough=3e-4)
     p = known_physics(truth)
     assert p.track.size == truth["rough"] == 3e-4
     steps = known_plans(truth)[0]
@@ -123,8 +115,8 @@ def test_strength_is_the_distance_moved(quick, tmp_path):
     assert set(truth["strength"]) == {"viscous-drag", "friction-drift"}
 
 
-def test_a_truth_survives_json(quick, tmp_path):
-    truth = make_case(tmp_path / "c", 2, kind="outside", rough=True, strengths=False)
+def test_a_truth_survives_json(tmp_path):
+    truth = make_case(tmp_path / "c", 2, **QUICK, kind="outside", rough=True, strengths=False)
     again = json.loads(json.dumps(truth, allow_nan=False))
     assert known_physics(again) == known_physics(truth)
     assert known_plans(again) == known_plans(truth)
@@ -149,11 +141,11 @@ def test_recipes_draw_what_is_asked_for():
     assert odd > 4  # a rigid baseline is no proof that compliance is concealed
 
 
-def test_a_slider_that_cannot_be_followed_is_drawn_again_and_in_the_end_told(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr("srfcli.validation.slider.STEPS_BETWEEN", 3)
-    assert not move(Physics(), SHORT[0]).complete
+def test_a_slider_that_cannot_be_followed_is_drawn_again_and_in_the_end_told(tmp_path):
+    lifted = Plan("lifted", ((0.6, 20.0),), 5.0, 0.004, steps=((0.2, -20.0),))  # no slider goes on where nothing presses
+    assert not move(Physics(), lifted).complete
     with pytest.raises(SrfError, match="none of 8 sliders"):
-        make_case(tmp_path / "c", 1)
+        make_case(tmp_path / "c", 1, plans=(lifted,))
     assert not (tmp_path / "c").exists()
 
 
@@ -200,25 +192,14 @@ SETTINGS = (
 )
 
 
-@pytest.fixture
-def set_in(monkeypatch):
-    """Let the wide bank have one setting, and one kind of noise."""
-
-    def chosen(setting, noise="white"):
-        monkeypatch.setattr("srfcli.validation.cases.settings", lambda **kind: [setting])
-        monkeypatch.setattr("srfcli.validation.cases.NOISE_SHARES", {noise: 1.0})
-
-    return chosen
-
-
 @pytest.mark.parametrize(
     ("setting", "noise"), list(zip(SETTINGS, ("ar1", "spikes", "one run louder", "1/f", "white", "gaps", "uneven"), strict=True))
 )
-def test_a_case_of_the_wide_bank_reads_back(set_in, tmp_path, setting, noise):
+def test_a_case_of_the_wide_bank_reads_back(tmp_path, setting, noise):
     """The reader finds the stated laws, and what it reads is what the truth predicts, to the gauge's noise."""
-    set_in(setting, noise)
     kind = "none" if setting.ageing == setting.stated else "ageing"
-    truth = make_case(tmp_path / "c", 12, kind=kind, rough=False, strengths=False, bank="wide")
+    choice = {"setting": setting, "noise": noise, "kind": kind, "rough": False}
+    truth = make_case(tmp_path / "c", 12, **choice, strengths=False, bank="wide")
     experiment = read_experiment(tmp_path / "c", registry=load_registry())
     choice, rig, gauge = experiment.choice, known_rig(truth), known_gauge(truth)
     assert (choice.law, choice.ageing, truth["protocol"], truth["noise"]) == (
@@ -277,9 +258,10 @@ def test_the_wide_bank_draws_what_it_says():
     assert all(0.1 <= a <= 0.5 for a in alphas)
 
 
-def test_an_effect_in_one_run_leaves_the_others_alone(set_in, tmp_path):
-    set_in(Setting("rock", "load-steps", "dieterich-ruina", "dieterich", "dieterich"))
-    truth = make_case(tmp_path / "c", 4, kind="one-run", effects=["tangential-crosstalk"], size=1.0, rough=False, bank="wide")
+def test_an_effect_in_one_run_leaves_the_others_alone(tmp_path):
+    setting = Setting("rock", "load-steps", "dieterich-ruina", "dieterich", "dieterich")
+    choice = {"setting": setting, "noise": "white", "kind": "one-run", "effects": ["tangential-crosstalk"], "size": 1.0}
+    truth = make_case(tmp_path / "c", 4, **choice, rough=False, bank="wide")
     assert truth["verdict"] == "identified" and truth["accept"] == ["unknown"]
     moved = truth["strength"]["tangential-crosstalk"]["rms_over_noise"]
     assert truth["only"] in ("first", "second") and moved[truth["only"]] > 1
@@ -288,9 +270,9 @@ def test_an_effect_in_one_run_leaves_the_others_alone(set_in, tmp_path):
     assert [name for name, acting_there in acts.items() if acting_there] == [truth["only"]]
 
 
-def test_the_same_seed_makes_the_same_case_of_the_wide_bank(set_in, tmp_path):
-    set_in(Setting("rock", "oscillation", "two-state", "ruina", "ruina"), "1/f")
-    made = [make_case(tmp_path / n, s, kind="single", effects=["drive-ripple"], bank="wide") for n, s in (("a", 3), ("b", 3))]
+def test_the_same_seed_makes_the_same_case_of_the_wide_bank(tmp_path):
+    choice = {"setting": Setting("rock", "oscillation", "two-state", "ruina", "ruina"), "noise": "1/f", "kind": "single"}
+    made = [make_case(tmp_path / name, 3, **choice, effects=["drive-ripple"], bank="wide") for name in "ab"]
     assert contents(tmp_path / "a") == contents(tmp_path / "b") and json.dumps(made[0]) == json.dumps(made[1])
     again = json.loads(json.dumps(made[0], allow_nan=False))
     assert known_plans(again) == known_plans(made[0]) and known_physics(again) == known_physics(made[0])
@@ -306,13 +288,11 @@ def test_effects_that_go_together_nowhere_are_told(tmp_path):
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A bank that is copied and left as it is."""
-    with pytest.MonkeyPatch.context() as patch:
-        shorten(patch)
-        return make_bank(tmp_path_factory.mktemp("made") / "bank", 3, 1, strengths=False)
+    return make_bank(tmp_path_factory.mktemp("made") / "bank", 3, SHORTEST, bank="wide", strengths=False)
 
 
 @pytest.fixture
-def bank(quick, made, tmp_path):
+def bank(made, tmp_path):
     """A bank to do anything to."""
     shutil.copytree(made.folder.parent, tmp_path, dirs_exist_ok=True)
     return replace(made, folder=tmp_path / made.folder.name, apart=tmp_path / made.apart.name)
@@ -325,14 +305,14 @@ def test_a_bank_is_sealed_and_opens(bank, tmp_path):
     assert bank.apart.parent == tmp_path  # beside the cases, not among them
     public = b" ".join(contents(bank.folder).values()).decode()
     assert not [n for n in ("alpha", "physics", 'truth"', "salt", "seed") if n in public]
-    again = make_bank(tmp_path / "again", 3, 1, strengths=False)
+    again = make_bank(tmp_path / "again", 3, SHORTEST, bank="wide", strengths=False)
     assert contents(again.folder) == contents(bank.folder)
     assert again.apart.read_bytes() == bank.apart.read_bytes()
 
 
 @pytest.mark.parametrize(("track", "rough", "own"), [("smooth", False, False), ("shared", True, False), ("rough", True, True)])
-def test_a_bank_is_on_the_tracks_that_are_asked_for(quick, tmp_path, track, rough, own):
-    made = make_bank(tmp_path / "bank", 3, 1, strengths=False, track=track)
+def test_a_bank_is_on_the_tracks_that_are_asked_for(tmp_path, track, rough, own):
+    made = make_bank(tmp_path / "bank", 3, SHORTEST, bank="wide", strengths=False, track=track)
     truths = unseal(made.folder, made.apart).values()
     assert {(truth["rough"] > 0, truth["own_track"]) for truth in truths} == {(rough, own)}
 
@@ -356,8 +336,9 @@ def _salt(bank):
 
 
 def _reading(bank):
-    path = bank.folder / "case-001" / "steps.csv"
-    path.write_bytes(path.read_bytes().replace(b".005", b".010", 1))
+    path = next((bank.folder / "case-001").glob("*.csv"))
+    *before, digit = path.read_text().rstrip()
+    path.write_text("".join(before) + ("1" if digit == "2" else "2") + "\n")
 
 
 def _extra(bank):

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli
 from hypothesis import given
 from hypothesis import strategies as st
 from in_workers import careless, deadly_at_one, peeks, remembers, says_none
@@ -50,14 +51,8 @@ SHORT = (
     Plan("wave", ((0.5, 20.0),), 7.0, 0.001, eps=0.2, f=110.0, onset=0.25),
     Plan("steps", ((0.8, 20.0), (0.8, 40.0), (1.0, 5.0)), 5.0, 0.004, steps=((1.2, 1.5),)),
 )
+SHORTEST = {"bank": "wide", "seed": 6}  # of cases whose runs cost little
 SURE = {"none": 0.0, "unknown": 0.01}
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """Cases of two short runs, one held out."""
-    plans = (SHORT[1], replace(SHORT[0], holdout=True))
-    monkeypatch.setattr("srfcli.validation.cases.draw_protocol", lambda rng: plans)
 
 
 @pytest.fixture(scope="module")
@@ -67,13 +62,13 @@ def made():
 
 
 @pytest.fixture
-def new_trial(quick, made, tmp_path_factory):
+def new_trial(made, tmp_path_factory):
     """`new_trial(folder, n)`: a trial of n cases in a new folder; its cases are made once and copied."""
 
     def copied(folder, n=4):
         if n not in made:
             made[n] = tmp_path_factory.mktemp("trials") / "t"
-            begin(made[n], cases=n, seed=3, kinds=(), resume=False, workers=1)
+            begin(made[n], cases=n, **SHORTEST, kinds=(), resume=False, workers=1)
         shutil.copytree(made[n], folder)
         return Trial(folder)
 
@@ -425,8 +420,9 @@ def test_a_wrong_stiffness_does_not_stand_out_where_no_mass_is_known():
     assert force > INVISIBLE  # a force is known, and a softer spring loads more slowly
 
 
-def test_the_true_model_leaves_the_noise(quick, tmp_path):
-    truth = make_case(tmp_path / "c", 5, effects=[ALPHA, "friction-drift"], size=0.9, rough=2e-4, strengths=False)
+def test_the_true_model_leaves_the_noise(tmp_path):
+    plans = (SHORT[1], replace(SHORT[0], holdout=True))
+    truth = make_case(tmp_path / "c", 5, plans=plans, effects=[ALPHA, "friction-drift"], size=0.9, rough=2e-4, strengths=False)
     found = see((tmp_path / "c", truth))
     assert set(found.known) == {"wave"}  # the held-out run
     assert 0.85 < found.known["wave"] / np.hypot(0.02, 0.005 / np.sqrt(12)) < 1.15
@@ -542,7 +538,7 @@ def test_a_trial_that_was_killed_ends_as_one_that_was_not(new_trial, tmp_path, a
         cut.bank.rename(cut.folder / "bank.part")
         next((cut.folder / "bank.part").glob("case-*/*.csv")).write_text("cut sh")
     before = cut.bank.stat().st_mtime_ns if cut.bank.exists() else None
-    begin(cut.folder, cases=1, seed=3, kinds=(), resume=True, workers=1)
+    begin(cut.folder, cases=1, **SHORTEST, kinds=(), resume=True, workers=1)
     assert before in (None, cut.bank.stat().st_mtime_ns)
     assert (cut.digest(), cut.waiting()) == (whole.digest(), ["case-000"])
     (cut.folder / ".answers.jsonl.abcdefgh.part").write_text('{"case": "case-0')  # killed while it wrote the first
@@ -568,7 +564,8 @@ def test_answers_that_were_damaged_are_named_and_asked_for_again(new_trial, tmp_
 def test_a_diagnosis_is_given_the_case_and_nothing_else(new_trial, tmp_path):
     trial = new_trial(tmp_path / "t", 1)
     (found,) = answer_all(trial, diagnose=peeks)
-    assert found.not_identifiable == ("experiment.toml", "steps.csv", "wave.csv")
+    description = tomli.loads((trial.bank / "case-000" / "experiment.toml").read_text())
+    assert found.not_identifiable == tuple(sorted(["experiment.toml", *(run["file"] for run in description["runs"])]))
     tree = ast.parse((ROOT / "srfcli" / "validation" / "blind.py").read_text())
     modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
     forbidden = ("srfcli.validation.cases", "srfcli.validation.slider", "srfcli.validation.trials", "srfcli.validation.marks")
@@ -614,17 +611,14 @@ def srf(*arguments):
     return stop.value.code
 
 
-@pytest.fixture
-def stub(quick, monkeypatch):
-    """The command with a diagnosis that costs nothing."""
-    monkeypatch.setattr(answer_all, "__kwdefaults__", {**answer_all.__kwdefaults__, "diagnose": says_none})
-
-
-def test_the_command_from_bank_to_report(stub, tmp_path, capsys):
+def test_the_command_from_bank_to_report(new_trial, tmp_path, capsys):
+    """Of a trial that others have answered: to diagnose a case costs minutes."""
     folder = tmp_path / "t"
-    assert srf("prove", "--cases", 4, "--seed", 3, "--out", folder) == 0
+    trial = new_trial(folder)
+    assert len(list(answer_all(trial, diagnose=says_none))) == 4
+    assert srf("prove", "--out", folder, "--resume") == 0
     printed = capsys.readouterr()
-    digest = Trial(folder).digest()
+    digest = trial.digest()
     assert printed.err.startswith(f"SHA-256 of the sealed truths: {digest}\n")
     kept = (folder / "report.txt").read_text()
     assert [line.split("  ")[0] for line in kept.splitlines()] == [line.split("  ")[0] for line in printed.out.splitlines()]
@@ -643,10 +637,11 @@ def test_the_command_from_bank_to_report(stub, tmp_path, capsys):
     assert "is a trial of cases 4, not 5" in capsys.readouterr().err
 
 
-def test_python_has_what_the_command_prints(stub, new_trial, tmp_path, capsys):
-    folder, stages = new_trial(tmp_path / "t", 2).folder, []
+def test_python_has_what_the_command_prints(new_trial, tmp_path, capsys):
+    folder, stages = tmp_path / "t", []
+    assert len(list(answer_all(new_trial(folder), diagnose=says_none))) == 4
     found = prove(folder, resume=True, progress=lambda stage, text, total: stages.append((stage, total)))
-    assert stages == [("sealed", None), *[("diagnosed", 2)] * 3, *[("truth", 2)] * 3] and not (folder / "report.json").exists()
+    assert set(stages) == {("sealed", None), ("diagnosed", 0), ("truth", 4)} and not (folder / "report.json").exists()
     assert srf("prove", "--report-only", folder, "--json") == 0
     assert json.loads(capsys.readouterr().out) == json.loads(to_json(found.table))
     assert srf("prove", "--report-only", folder, "--csv") == 0
@@ -655,23 +650,24 @@ def test_python_has_what_the_command_prints(stub, new_trial, tmp_path, capsys):
     found.plot(ax=axes)
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == [f"{row[0]}: {row[1]} of {row[2]}" for row in found.more[0].rows]
-    assert sum(row[1] for row in found.table.rows) == len(found.cases.rows) == 2
+    assert sum(row[1] for row in found.table.rows) == len(found.cases.rows) == 4
 
 
-def test_the_command_on_the_wide_bank(stub, tmp_path, monkeypatch, capsys):
-    """Rock in a press, steps of the load alone: from the bank to the tables by apparatus, protocol, law, noise and field."""
-    monkeypatch.setattr("srfcli.validation.apparatus.RIG_SHARES", {"rock": 1.0})
-    monkeypatch.setattr("srfcli.validation.apparatus.PROTOCOLS", {"load-steps": 1.0})
+def test_the_command_on_the_wide_bank(tmp_path, capsys):
+    """From the bank to the tables by apparatus, protocol, law, noise and field; diagnoses are cut off as soon as they begin."""
     folder = tmp_path / "t"
     kinds = ("--kind", "none", "--kind", "ageing")
-    assert srf("prove", "--bank", "wide", "--cases", 3, "--seed", 5, *kinds, "--out", folder) == 0
-    assert "By apparatus, protocol, law, noise and field: right" in capsys.readouterr().out
+    assert srf("prove", "--bank", "wide", "--cases", 3, "--seed", 6, *kinds, "--limit", 1e-4, "--out", folder) == 0
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"SHA-256 of the sealed truths: {Trial(folder).digest()}\n")
+    assert "By apparatus, protocol, law, noise and field: right" in printed.out
+    assert all("s of CPU" in answer.failure for answer in read_answers(Trial(folder).answers).values())
     data = json.loads((folder / "report.json").read_bytes())
     assert {m["kind"] for m in data["meta"]["marks"]} == {"none", "ageing"}
     assert all(m["sigmas"] > INVISIBLE for m in data["meta"]["marks"] if m["kind"] == "ageing")
     found = {(r["circumstance"], r["value"]): r["cases"] for r in data["meta"]["settings"]}
-    assert found["protocol", "load-steps"] == 3
-    assert {name for name, _ in found} == {"apparatus", "protocol", "friction law", "ageing law", "noise", "field"}
+    names = {"apparatus", "protocol", "friction law", "ageing law", "noise", "field"}
+    assert {name: sum(n for (own, _), n in found.items() if own == name) for name, _ in found} == dict.fromkeys(names, 3)
     assert srf("prove", "--out", folder, "--resume", "--bank", "paper") == 2
     assert "is a trial of bank wide, not paper" in capsys.readouterr().err
 

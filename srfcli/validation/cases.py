@@ -221,7 +221,7 @@ class Asked:
     """What a case is asked to be; what is None is drawn.
 
     `size` from 0 to 1 is how strong the effects are, `rough` whether the track is, or the standard deviation of its mu0, `own`
-    whether each run has a field of its own.
+    whether each run has a field of its own; `plans` are the runs, `setting` and `noise` those of a case of the wide bank.
     """
 
     kind: str | None = None
@@ -229,6 +229,9 @@ class Asked:
     size: float | None = None
     rough: bool | float | None = None
     own: bool | None = None
+    plans: tuple[Plan, ...] | None = None
+    setting: Setting | None = None
+    noise: str | None = None
 
 
 NOTHING = Asked()
@@ -244,7 +247,7 @@ def draw_recipe(rng: np.random.Generator, asked: Asked = NOTHING) -> Recipe:
         physics = effect.added(physics, rng, strength)
     physics = replace(physics, track=track)
     baseline = without(physics, chosen)
-    plans = draw_protocol(rng)
+    plans = asked.plans or draw_protocol(rng)
     lag1 = float(rng.uniform(0.3, REDDEST))
     gauge = Gauge(lag1=0.0 if rng.uniform() < WHITE_SHARE else lag1)
     drawn_own = rng.uniform() < OWN_SHARE
@@ -271,9 +274,9 @@ def draw_wide(rng: np.random.Generator, asked: Asked = NOTHING) -> Recipe:
     kind = str(rng.choice(WIDE_KINDS, p=WIDE_SHARES)) if kind is None else kind
     check_kinds((kind,), "wide")
     names = wide_names(rng, kind) if effects is None else tuple(effects)
-    forms, setting = _set(rng, kind, names)
+    forms, setting = _set(rng, kind, names, [asked.setting] if asked.setting else settings(wrong_ageing=kind == "ageing"))
     physics, plans = draw_setup(rng, setting)
-    plans = plans or draw_protocol(rng)
+    plans = asked.plans or plans or draw_protocol(rng)
     if setting.apparatus == "paper" and rng.uniform() < ODD_SHARE and _may_be_odd(forms, setting):
         which = str(rng.choice(("rigid", "massless")))
         physics = replace(physics, rigid=which == "rigid", massless=which == "massless")
@@ -287,7 +290,7 @@ def draw_wide(rng: np.random.Generator, asked: Asked = NOTHING) -> Recipe:
     physics = replace(physics, track=replace(track, own=bool(track.size) and (drawn_own if asked.own is None else asked.own)))
     if kind == "ageing":
         forms, sizes = (other_ageing(setting.ageing, setting.stated),), (1.0,)
-    noise = str(rng.choice(list(NOISE_SHARES), p=list(NOISE_SHARES.values())))
+    noise = asked.noise or str(rng.choice(list(NOISE_SHARES), p=list(NOISE_SHARES.values())))
     plans = disturbed(rng, plans, noise)
     rig = str(rng.choice([name for name in RIGS if name.partition("-")[0] == setting.apparatus]))
     gauge = draw_gauge(rng, rig, physics, noise)
@@ -304,10 +307,12 @@ def wide_names(rng: np.random.Generator, kind: str) -> tuple[str, ...]:
     return (str(rng.choice(known)),) if known else ()
 
 
-def _set(rng: np.random.Generator, kind: str, names: Sequence[str]) -> tuple[tuple[Effect, ...], Setting]:
-    """Return the effects in forms and sizes of a setting in which they make sense, and the setting."""
+def _set(
+    rng: np.random.Generator, kind: str, names: Sequence[str], every: Sequence[Setting]
+) -> tuple[tuple[Effect, ...], Setting]:
+    """Return the effects in forms and sizes of a setting in which they make sense, and the setting, one of these."""
     forms = _forms(rng, names)
-    found = [s for s in settings(wrong_ageing=kind == "ageing") if all(possible(e.varies, s) for e in forms)]
+    found = [s for s in every if all(possible(e.varies, s) for e in forms)]
     if kind == "one-run":
         found = [s for s in found if s.protocol != "steps"]  # which is one run
     if not found:
@@ -500,21 +505,24 @@ def make_case(
     size: float | None = None,
     rough: bool | float | None = None,
     own: bool | None = None,
+    plans: tuple[Plan, ...] | None = None,
+    setting: Setting | None = None,
+    noise: str | None = None,
     strengths: bool = True,
     bank: str = "paper",
 ) -> Truth:
     """Write a concealed experiment to the new folder `folder` and return the truth about it, ready for JSON.
 
-    `kind` is none, single, pair or outside, in the wide `bank` also ageing or one-run; `effects` names them. With `strengths`
-    every run is moved again without each effect, to know how far it moves the record. The same seed and choices give the same
-    bytes.
+    `kind` is none, single, pair or outside, in the wide `bank` also ageing or one-run; `effects` names them; the rest is as in
+    `Asked`. With `strengths` every run is moved again without each effect, to know how far it moves the record. The same seed and
+    choices give the same bytes.
     Raises SrfError for unknown names, and where the folder exists.
     """
     if folder.exists():
         raise SrfError(f"{folder} exists already", "A case is never overwritten; name another folder.")
     if bank not in BANKS:
         raise SrfError(f"unknown bank '{bank}'", did_you_mean(bank, BANKS))
-    asked = Asked(kind, effects, size, rough, own)
+    asked = Asked(kind, effects, size, rough, own, plans, setting, noise)
     recipe, motions, attempt = _moving(seed, draw_wide if bank == "wide" else draw_recipe, asked)
     rng, rig = np.random.default_rng([*_whole(seed), attempt, 1]), RIGS[recipe.rig]
     readings = {
