@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import _thread
 import csv
 import io
 import json
 import math
 import os
+import re
 import threading
-from dataclasses import replace
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from brittle_law import END, brittle_law
 from click.testing import CliRunner, Result
 
 import srfcli
 from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiler
-from srfcli.core.errors import Status
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment
 from srfcli.laws.registry import load_registry
@@ -334,69 +338,86 @@ def test_nothing_is_overwritten_and_no_recording_replaced(empty_folder: Path) ->
     assert (empty_folder / "made" / "simulated.csv").read_bytes() != content
 
 
-def test_what_stops_early_is_written_as_far_as_it_went(monkeypatch: pytest.MonkeyPatch) -> None:
-    import dataclasses
-
-    from srfcli.core.errors import Status
-    from srfcli.motion import simulate as integrate
-
-    real = integrate.simulate
-
-    def stops(*args: Any, **options: Any) -> Any:
-        trace = real(*args, **options)
-        trace.x[500:] = np.nan
-        return dataclasses.replace(trace, status=Status.INTEGRATION, reached=float(trace.t[499]))
-
-    monkeypatch.setattr(integrate, "simulate", stops)
-    done = simulate("--V", "8", "--W0", "5", "--for", "2", "--out-dir", "made", "--csv", code=3)
-    assert len(done.stdout.splitlines()) == 501 and "stopped at t = 0.499 s of 2 s" in done.stderr
+def test_what_stops_early_is_written_as_far_as_it_went(empty_folder: Path) -> None:
+    brittle = ("--plugins", str(brittle_law(empty_folder)), "--law", "brittle", "--interface", "rigid", "--no-inertia")
+    done = simulate(*brittle, "--drive", "1:8, 3:0", "--W0", "5", "--rate", "100", "--out-dir", "made", "--csv", code=3)
+    rows = [[float(cell) for cell in line.split(",")] for line in done.stdout.splitlines()[1:]]
+    (reached,) = re.findall(r"stopped at t = ([\d.]+) s of 4 s", done.stderr)
+    assert np.isfinite(rows).all() and 1 + 0.9 * END < rows[-1][0] <= float(reached) < rows[-1][0] + 0.01
     assert "Not written: made" in done.stderr and not Path("made").exists()
 
 
-def test_ctrl_c_keeps_the_runs_that_are_done(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from srfcli.motion import simulate as integrate
+RUNS = """format = "srf-experiment/1"
+title = "a hold that nothing follows, and days of stick-slip"
 
-    real, calls = integrate.simulate, []
+[apparatus]
+stiffness = "0.21 N/um"
 
-    def interrupted(*args: Any, **options: Any) -> Any:
-        calls.append(1)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return real(*args, **options)
+[model]
+law = "brittle.toml"
+ageing = "dieterich"
+interface = "rigid"
+inertia = false
+"""
 
-    monkeypatch.setattr(integrate, "simulate", interrupted)
-    done = simulate(str(shared / "cases" / "open-01"), "--csv", code=130)
-    assert {line.split(",")[0] for line in done.stdout.splitlines()[1:]} == {"steps", "stickslip"}
+
+def holds(folder: Path) -> None:
+    """Write an experiment of two runs of steady sliding, a hold of 3 s that the law does not survive, and one of stick-slip."""
+    text = RUNS
+    brittle_law(folder)
+    for name, (drive, W, t) in {
+        "first": ([(1.0, 8.0)], 5.0, np.arange(0.0, 1.0, 0.01)),
+        "hold": ([(1.0, 8.0), (3.0, 0.0)], 5.0, np.arange(0.0, 4.0, 0.01)),
+        "long": ([(20_000.0, 8.0)], 9.0, np.arange(0.0, 20_000.0)),
+    }.items():
+        pieces = ", ".join(f"{{ duration = {d}, velocity = {V} }}" for d, V in drive)
+        text += f'\n[[runs]]\nname = "{name}"\nfile = "{name}.csv"\nload = "{W} N"\ndrive = [{pieces}]\n'
+        rows = np.column_stack([t, np.full(t.size, 10.0) + 1e-3 * np.sin(7 * t)])
+        np.savetxt(folder / f"{name}.csv", rows, delimiter=",", header="time [s],elongation [um]", comments="", fmt="%.6g")
+    (folder / "experiment.toml").write_text(text)
+
+
+def test_ctrl_c_keeps_the_runs_that_are_done(empty_folder: Path, srf_ended_at: Any) -> None:
+    """Whatever became of them."""
+    holds(empty_folder)
+    code, out, err = srf_ended_at("2/3  long", "simulate", ".", "--csv")
+    assert code == 130 and {line.split(",")[0] for line in out.splitlines()[1:]} == {"first", "hold"}
+    assert "hold: stopped at t = " in err
 
 
 @pytest.mark.skipif(compiler() is None, reason="LSODA is not interrupted within a piece")
-def test_ctrl_c_keeps_what_was_reached_of_a_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    from srfcli.motion import integrators
-
-    def interrupted(call: Any, stop: Any) -> int:
-        timer = threading.Timer(0.05, lambda: setattr(stop, "value", 1))
-        timer.start()
-        call()  # days of stick-slip, of which it ends with the step in hand
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(integrators, "interruptible", interrupted)
-    done = simulate("--V", "8", "--W0", "9", "--no-inertia", "--for", "300000", "--rate", "1", "--csv", code=130)
+def test_ctrl_c_keeps_what_was_reached_of_a_record(empty_folder: Path) -> None:
+    """And ends the command, whatever became of other records."""
+    holds(empty_folder)
+    with pressed_during_a_long_integration():
+        done = simulate(".", "--csv", code=130)
     rows = [line.split(",") for line in done.stdout.splitlines()[1:]]
-    assert 0 < len(rows) < 300_000 and all(np.isfinite(float(cell)) for row in rows for cell in row)
-    assert f"stopped at t = {float(rows[-1][0]):.6g} s of 300000 s" in done.stderr
+    assert {row[0] for row in rows} == {"first", "hold", "long"}
+    (reached,) = re.findall(r"long: stopped at t = ([\d.]+) s of 19999 s", done.stderr)
+    assert float(rows[-1][1]) == pytest.approx(float(reached), rel=1e-5) and float(reached) < 19_999
+    assert all(np.isfinite(float(cell)) for row in rows for cell in row[1:])
 
 
-def test_an_interrupted_record_ends_the_command_whatever_became_of_others(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from srfcli.motion import simulate as integrate
+@contextmanager
+def pressed_during_a_long_integration() -> Iterator[None]:
+    """Press Ctrl-C when compiled code has been at work for a second, in a thread beside the main one."""
+    done, before = threading.Event(), set(threading.enumerate())
 
-    real, ends = integrate.simulate, [Status.INTEGRATION, Status.INTERRUPTED]
+    def watch() -> None:
+        begun = dict[threading.Thread, float]()
+        while not done.wait(0.01):
+            for thread in {*threading.enumerate()} - before - {threading.current_thread()}:
+                if time.monotonic() - begun.setdefault(thread, time.monotonic()) > 1.0:
+                    _thread.interrupt_main()
+                    return
 
-    def ended(*args: Any, **options: Any) -> Any:
-        return replace(real(*args, **options), status=ends.pop(0))
-
-    monkeypatch.setattr(integrate, "simulate", ended)
-    done = simulate(str(shared / "cases" / "open-01"), "--csv", code=130)
-    assert {line.split(",")[0] for line in done.stdout.splitlines()[1:]} == {"steps", "stickslip"} and not ends
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        yield
+    finally:
+        done.set()
+        watcher.join()
 
 
 # what is asked
