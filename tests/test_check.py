@@ -22,7 +22,6 @@ from srfcli.codegen.model import open_model
 from srfcli.data.experiment import check_run, read_experiment
 from srfcli.data.gauge import GaugeNoise, with_slower
 from srfcli.data.values import Experiment, FitParameter
-from srfcli.inference import cramer_rao
 from srfcli.inference.cramer_rao import CramerRaoBound, Forecast, forecast
 from srfcli.inference.fit import fit_problem
 from srfcli.inference.prediction import predict
@@ -42,8 +41,8 @@ def srf(*arguments: str, code: int = 0) -> Result:
     return done
 
 
-def told(experiment: Experiment, *, apparatus: bool = False) -> Forecast:
-    return forecast(experiment, [check_run(run) for run in experiment.runs], registry=REGISTRY, apparatus=apparatus)
+def told(experiment: Experiment, *, apparatus: bool = False, **more: int) -> Forecast:
+    return forecast(experiment, [check_run(run) for run in experiment.runs], registry=REGISTRY, apparatus=apparatus, **more)
 
 
 @pytest.fixture
@@ -252,11 +251,11 @@ def test_bounds_and_free_starts_cost_what_they_must(made: Path) -> None:
         assert bounded[name] == pytest.approx(least[name], rel=1e-3)
 
 
-def test_a_long_run_is_thinned_without_another_answer(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_run_is_thinned_without_another_answer(made: Path) -> None:
     experiment = read_experiment(made, registry=REGISTRY)
     whole = told(experiment).runs[1].errors
-    monkeypatch.setattr(cramer_rao, "MOST_SIMULATED", 900)
-    thin = told(experiment).runs[1].errors
+    thin = told(experiment, most=900).runs[1].errors
+    assert thin != whole
     for name in whole:  # what a step of the load makes takes a few samples, of which blocks have more or fewer
         assert thin[name] == pytest.approx(whole[name], rel=0.3)
 

@@ -14,7 +14,6 @@ from click.testing import CliRunner
 from srfcli.cli.main import cli
 from srfcli.codegen.slider import system
 from srfcli.core.errors import SrfError, Status
-from srfcli.numerics import compare
 from srfcli.numerics.compare import (
     LawPart,
     LawStudy,
@@ -28,6 +27,7 @@ from srfcli.numerics.compare import (
     law_parts,
     match,
     observe,
+    reentrance,
     study_part,
     turns,
 )
@@ -167,14 +167,12 @@ def test_a_study_without_re_entrance_says_so(model):
         ((False, False), lambda eps: False, None, None),
     ],
 )
-def test_re_entrance_that_comes_and_goes_between_two_amplitudes_is_seen(model, monkeypatch, several, there, onset, end):
+def test_re_entrance_that_comes_and_goes_between_two_amplitudes_is_seen(model, several, there, onset, end):
     """`several` is what the maps at 0 and 0.13 say; between them each amplitude is asked for, and brackets hold the edges."""
-    fold, plain = np.array([[5.0, 10], [9, 12], [7, 15]]), np.array([[5.0, 10], [9, 12]])
-    monkeypatch.setattr(compare, "_followed", lambda m, t, eps: iter([[fold if there(eps) else plain]]))
-    task = LawTask(model.source, model.key, model.vector(), (0.0, 0.13), WINDOW, onset=1e-3)
-    known = {part.eps: bool(study_part(part)["several"]) for part in law_parts(task) if not part.mapped}
+    task = LawTask(model.source, model.key, model.vector(), (0.0, 0.13), WINDOW)
+    known = {part.eps: there(part.eps) for part in law_parts(task) if not part.mapped}
     known |= dict(zip(task.amplitudes, several, strict=True))
-    for (low, high), edge in zip(compare._reentrance(model, task, known), (onset, end), strict=True):
+    for (low, high), edge in zip(reentrance(known, there, within=1e-3), (onset, end), strict=True):
         if edge is None:
             assert np.isnan([low, high]).all()
         else:

@@ -14,7 +14,6 @@ from click.testing import CliRunner
 import srfcli as srf
 from srfcli.cli.main import cli
 from srfcli.data.experiment import read_experiment
-from srfcli.diagnosis import design as module
 from srfcli.diagnosis.design import (
     BEYOND_SHOWN,
     TOLD_APART,
@@ -163,23 +162,19 @@ def test_the_difference_is_where_it_is_said_to_be(diagnosis: Diagnosis, found: D
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_run(diagnosis: Diagnosis, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "CANDIDATE_RUNS", 4)
-    monkeypatch.setattr(module, "VARIATIONS", 1)
-    made = [discriminating_run(SHIPPED, diagnosis, seed=seed) for seed in (1, 1, 2)]
+def test_the_same_seed_gives_the_same_run(diagnosis: Diagnosis) -> None:
+    made = [discriminating_run(SHIPPED, diagnosis, seed=seed, tried=4, varied=1) for seed in (1, 1, 2)]
     assert made[0] is not None and made[1] is not None and made[2] is not None
     assert made[0].proposal == made[1].proposal != made[2].proposal and made[0].gain == made[1].gain
     assert made[0].tried == 5
 
 
-def test_one_class_is_said_to_be_one(diagnosis: Diagnosis, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_class_is_said_to_be_one(diagnosis: Diagnosis) -> None:
     """A hypothesis beside its own double, and a third: no run discriminates between these two."""
-    monkeypatch.setattr(module, "CANDIDATE_RUNS", 4)
-    monkeypatch.setattr(module, "VARIATIONS", 1)
     first, second = diagnosis.close
     (effect,) = first.hypothesis.effects
     double = replace(first, hypothesis=Hypothesis((replace(effect, name="double", answers="double"),)))
-    best = discriminating_run(SHIPPED, replace(diagnosis, close=(first, double, second)))
+    best = discriminating_run(SHIPPED, replace(diagnosis, close=(first, double, second)), tried=4, varied=1)
     assert best is not None and best.names == (first.name, "double", second.name)
     assert best.gain < 1e-3 < WORTH_MAKING and not best.discriminates and best.repeats is None
     assert "one class" in sentences(best)[0] and first.name in sentences(best)[0]

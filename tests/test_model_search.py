@@ -12,13 +12,10 @@ from srfcli.codegen.c_source import compiler
 from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import grouped
 from srfcli.data.values import FitParameter
-from srfcli.diagnosis import goodness_of_fit as of_goodness_of_fit
-from srfcli.diagnosis import search as of_search
 from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.scores import Remainder, Scores
 from srfcli.diagnosis.search import MOST_EFFECTS, ModelSearch
 from srfcli.diagnosis.verdict import conclude
-from srfcli.inference import state_space
 from srfcli.inference.state_space import (
     DEVIATION,
     NEEDED,
@@ -81,8 +78,8 @@ def fitted(experiment):
     return fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=())
 
 
-def said(folder, effects=FEW):
-    search = ModelSearch(SHIPPED, read_experiment(folder, registry=SHIPPED, holdout=False), effects=effects)
+def said(folder, effects=FEW, by=ModelSearch):
+    search = by(SHIPPED, read_experiment(folder, registry=SHIPPED, holdout=False), effects=effects)
     search.run()
     return conclude(search, read_experiment(folder, registry=SHIPPED))
 
@@ -123,11 +120,9 @@ def test_what_is_missing_is_named_on_rough_tracks(ageing):
     assert sum(h.predicted.gain for h in found.held) > 0
 
 
-def test_a_search_without_budget_ends_at_the_baseline_and_says_so(ageing, monkeypatch):
+def test_a_search_without_budget_ends_at_the_baseline_and_says_so(ageing):
     """A fit under way is given up; scores are there all the same, and a baseline that passes is not said to lack nothing."""
-    monkeypatch.setattr(of_search, "BUDGET", 0.0)
-    monkeypatch.setattr(of_search, "BASELINES", 0.0)
-    found = said(ageing)
+    found = said(ageing, by=type("Spent", (ModelSearch,), {"spent": True}))
     assert [f.name for f in found.ranked] == ["none"] and found.verdict == "inconclusive"
     assert {s.effect.reported for s in found.scores} >= {"linker-dieterich", "viscous-drag"}
     assert any("the search ended at its budget" in reason for reason in found.reasons)
@@ -173,10 +168,14 @@ def test_colour_that_no_effect_explains_is_the_gauges(tmp_path):
     assert conclude(search, read_experiment(folder, registry=SHIPPED)).verdict == "none"
 
 
-def test_where_nothing_passes_the_models_after_the_best_are_expanded(ageing, monkeypatch):
-    """A limit that no fit can keep: nothing passes, and each model of one effect is asked what it lacks."""
-    monkeypatch.setattr(of_goodness_of_fit, "DEVIATION", 1e-3)
-    search = ModelSearch(SHIPPED, read_experiment(ageing, registry=SHIPPED, holdout=False), effects=FEW[:3])
+def test_where_nothing_passes_the_models_after_the_best_are_expanded(ageing):
+    """Under a test that no fit passes each model of one effect is asked what it lacks."""
+
+    class Strict(ModelSearch):
+        def fit(self, move):
+            return replace(super().fit(move), against=("it might be better",))
+
+    search = Strict(SHIPPED, read_experiment(ageing, registry=SHIPPED, holdout=False), effects=FEW[:3])
     search.run()
     singles = [f for f in search.fitted.values() if len(f.hypothesis.effects) < MOST_EFFECTS]
     assert not search.best().passes and len(singles) > 2 and not search.cut_short
@@ -184,15 +183,16 @@ def test_where_nothing_passes_the_models_after_the_best_are_expanded(ageing, mon
 
 
 @pytest.mark.slow
-def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(ageing, monkeypatch):
+def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(ageing):
     """A search that takes every third reading says what one of all does; its fits are to all, at the same maximum."""
     experiment = read_experiment(ageing, registry=SHIPPED, holdout=False)
     every = fit_state_space(Hypothesis().problem(SHIPPED, experiment))
-    monkeypatch.setattr(state_space, "MANY_READINGS", every.likelihood.samples // 3)
-    parts = fit_state_space(Hypothesis().problem(SHIPPED, experiment))
+    many = every.likelihood.samples // 3
+    parts = fit_state_space(Hypothesis().problem(SHIPPED, experiment), many=many)
     assert parts.likelihood.samples == every.likelihood.samples
     assert parts.log_likelihood == pytest.approx(every.log_likelihood, abs=0.1)
-    found = said(ageing, effects=("linker-dieterich", "viscous-drag", "sensor-lag"))
+    search = type("InParts", (ModelSearch,), {"options": {"many": many}})
+    found = said(ageing, effects=("linker-dieterich", "viscous-drag", "sensor-lag"), by=search)
     assert (found.verdict, found.effects) == ("identified", ("linker-dieterich",))
     assert {f.fit.likelihood.samples for f in found.ranked} == {every.likelihood.samples}
     assert found.best.fit.values["alpha"] == pytest.approx(0.03, abs=0.005)

@@ -19,7 +19,7 @@ from in_workers import deadly, faulty, fragile, slow, square
 from srfcli.cli.main import cli
 from srfcli.cli.options import Spread
 from srfcli.core.errors import SrfError
-from srfcli.core.parallel import Store, fingerprint, run_here, run_processes, stored
+from srfcli.core.parallel import Store, fingerprint, run_cluster, run_here, run_processes, stored
 from srfcli.numerics.map import compute_map, solve_tile
 from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings, tile_tasks
 
@@ -348,12 +348,11 @@ def test_a_worker_of_the_cluster_killed_in_mid_run_costs_its_tile(model, cluster
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_cluster_that_is_not_there_is_told(monkeypatch):
+def test_a_cluster_that_is_not_there_is_told():
     if not _has_distributed():
         pytest.skip("DASK.DISTRIBUTED ABSENT: pip install 'srfcli[cluster]' to test --cluster")
-    monkeypatch.setattr("srfcli.core.parallel.SCHEDULER_TIMEOUT", "1s")
     with pytest.raises(SrfError, match="no scheduler answers"):
-        list(Spread(cluster="tcp://127.0.0.1:1").run(square, TASKS))
+        list(run_cluster(square, TASKS, address="tcp://127.0.0.1:1", timeout="1s"))
 
 
 def test_without_the_library_the_extra_is_named(monkeypatch):

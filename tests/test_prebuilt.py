@@ -32,8 +32,7 @@ def tool() -> ModuleType:
     return module
 
 
-def test_every_shipped_system_is_there_under_its_present_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("srfcli.codegen.model.cached_source", lambda key, build: pytest.fail(f"not shipped: {REPAIR}"))
+def test_every_shipped_system_is_there_under_its_present_key() -> None:
     keys = {open_model(bundled_registry(), **asked).key[:16] for asked in tool().shipped_systems()}
     assert {path.stem for path in SHIPPED_MODELS.glob("*.py")} == keys, REPAIR
     assert (SHIPPED_MODELS / "headers.json").read_text(encoding="utf-8") == tool().headers_text(), REPAIR
@@ -73,17 +72,16 @@ def test_an_edited_law_of_a_shipped_name_is_derived_anew(tmp_path: Path) -> None
     assert find_built(one.key) is not None and find_built(other.key) is None
 
 
-def test_a_module_of_another_key_or_a_damaged_one_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_of_another_key_or_a_damaged_one_is_passed_over(tmp_path: Path) -> None:
     key = open_model(bundled_registry()).key
     place = tmp_path / f"{key[:16]}.py"
     shutil.copy(SHIPPED_MODELS / place.name, place)
-    monkeypatch.setattr("srfcli.core.cache.SHIPPED_MODELS", tmp_path)
-    assert find_built(key) is not None
-    assert find_built(key[:16] + "0" * 48) is None
+    assert find_built(key, tmp_path) is not None
+    assert find_built(key[:16] + "0" * 48, tmp_path) is None
     place.write_bytes(b"\xff\xfe")
-    assert find_built(key) is None
+    assert find_built(key, tmp_path) is None
     place.unlink()
-    assert find_built(key) is None
+    assert find_built(key, tmp_path) is None
 
 
 def test_a_first_start_derives_nothing(tmp_path: Path) -> None:

@@ -48,6 +48,7 @@ def test_a_model_that_passes_is_taken_where_one_that_does_not_is_hardly_ahead_of
     assert (found.verdict, found.effects) == said
     best = "viscous-drag: nothing is left that a test finds" if said[1] else "slip-evolution: a stretch of steps is off"
     assert found.reasons[0] == best
+    assert (found.confidence["viscous-drag"] > 0.9) is bool(said[1])
 
 
 @pytest.mark.parametrize("ended", [None, 150.0])
@@ -131,13 +132,15 @@ def test_effects_of_one_signal_are_one_class():
         score("viscous-drag", SEEN), score("slip-evolution", SEEN, (0.99, 0.1411)), score("friction-drift", SEEN, (0.0, 1.0)),
     ]  # fmt: skip
     assert concluded(DRAG, LOST, scores=scores).equivalent == (("viscous-drag", "slip-evolution"),)
+    also = [*scores, score("sensor-lag", SEEN, (0.0, 1.0))]  # like a drift, of which nothing is said
+    assert concluded(DRAG, LOST, scores=also).equivalent == (("viscous-drag", "slip-evolution"),)
     apart = concluded(DRAG, model("slip-evolution", evidence=90.0), LOST, scores=scores)  # both were fitted
     assert not apart.equivalent
 
 
 def test_an_effect_that_parameters_absorb_is_not_identifiable():
     lost = replace(score("viscous-drag", HIDDEN), tolerance=1e-4)
-    found = concluded(model(evidence=0.0), scores=[lost, score("friction-drift", SEEN)])
+    found = concluded(model(evidence=0.0), scores=[lost, score("friction-drift", SEEN), score("sensor-lag", HIDDEN)])
     assert [x.effect for x in found.not_identifiable] == ["viscous-drag"]
     assert "99.99 %" in found.not_identifiable[0].reason
     assert not concluded(DRAG, LOST, scores=[lost]).not_identifiable  # it is found all the same
@@ -169,14 +172,20 @@ def test_an_interesting_size_is_in_base_units():
 
 
 @pytest.mark.parametrize(
-    ("apart", "said"), [(1e-3, ("identified", ("ruina",))), (0.5, ("ambiguous", ("ruina", "slip-evolution")))]
+    ("apart", "evidence", "said"),
+    [
+        (1e-3, 97.0, ("identified", ("ruina",))),
+        (0.5, 97.0, ("ambiguous", ("ruina", "slip-evolution"))),
+        (1e-3, 104.0, ("ambiguous", ("slip-evolution", "ruina"))),
+    ],
 )
-def test_an_effect_that_became_another_ageing_law_gives_way_to_it(apart, said):
-    """Where both leave the same innovations; where they do not, either may be it."""
+def test_an_effect_that_became_another_ageing_law_gives_way_to_it(apart, evidence, said):
+    """Where both leave the same innovations; where they do not, or more is to be said for the effect, either may be it."""
     white = np.where(np.arange(400) % 2, 1.0, -1.0)
     law = Model(Hypothesis((), "ruina"), 100.0, innovations=(white,), parameters=5)
-    found = concluded(law, model("slip-evolution", evidence=97.0, innovations=(white + apart,), parameters=6), LOST)
+    found = concluded(law, model("slip-evolution", evidence=evidence, innovations=(white + apart,), parameters=6), LOST)
     assert (found.verdict, found.effects) == said
+    assert sum(found.confidence.values()) == pytest.approx(1)
     assert found.became == ({"slip-evolution": "ruina"} if len(said[1]) == 1 else {})
 
 
@@ -196,3 +205,9 @@ def test_models_that_held_out_runs_do_not_tell_apart_where_none_is_followed_are_
         model("slip-evolution", evidence=100.0, held_out=-np.inf), model("viscous-drag", evidence=90.0, held_out=-np.inf), LOST
     )
     assert (found.verdict, found.effects) == ("identified", ("slip-evolution",))
+    assert found.confidence["slip-evolution"] == pytest.approx(1 - UNEXPLAINED, rel=1e-3)
+
+
+def test_held_out_runs_may_choose_a_model_that_fits_worse():
+    found = concluded(model("slip-evolution", evidence=100.0, held_out=-40.0), model("viscous-drag", evidence=80.0), LOST)
+    assert (found.verdict, found.effects) == ("identified", ("viscous-drag",))

@@ -209,9 +209,9 @@ class Built:
     code: CodeType | None = None
 
 
-def find_built(key: str) -> Built | None:
+def find_built(key: str, folder: Path = SHIPPED_MODELS) -> Built | None:
     """Return the module that was built under this key, or None where none is shipped."""
-    path = SHIPPED_MODELS / f"{key[:16]}.py"
+    path = folder / f"{key[:16]}.py"
     try:
         first, _, body = path.read_text(encoding="utf-8").partition("\n")
     except (OSError, ValueError):

@@ -180,8 +180,10 @@ def _end_with_parent() -> None:
 SCHEDULER_TIMEOUT = "10s"  # for the scheduler's first answer
 
 
-def run_cluster(function: Callable[[Task], Result], tasks: Sequence[Task], *, address: str) -> Iterator[tuple[int, Result]]:
-    """Yield (index, result) of every task as the cluster at `address` finishes it.
+def run_cluster(
+    function: Callable[[Task], Result], tasks: Sequence[Task], *, address: str, timeout: str = SCHEDULER_TIMEOUT
+) -> Iterator[tuple[int, Result]]:
+    """Yield (index, result) of every task as the cluster at `address` finishes it; its first answer is awaited for `timeout`.
 
     The workers need this package in the same version. Raises SrfError where dask.distributed is not installed, where no scheduler
     answers or has no workers, and where the workers at a task keep dying.
@@ -191,7 +193,7 @@ def run_cluster(function: Callable[[Task], Result], tasks: Sequence[Task], *, ad
     except ImportError as error:
         raise SrfError("--cluster needs dask.distributed, which is not installed", 'pip install "srfcli[cluster]"') from error
     try:
-        client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
+        client = Client(address, timeout=timeout, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SrfError(
             f"--cluster {address}: no scheduler answers", "Start one with 'dask scheduler', and give the address it prints."

@@ -179,15 +179,18 @@ class Trial:
     gain: float = 0.0
 
 
-def discriminating_run(registry: Registry, diagnosis: Diagnosis, *, seed: int = 0) -> DiscriminatingRun | None:
+def discriminating_run(
+    registry: Registry, diagnosis: Diagnosis, *, seed: int = 0, tried: int = CANDIDATE_RUNS, varied: int = VARIATIONS
+) -> DiscriminatingRun | None:
     """Return the run that would discriminate between what a diagnosis found equally good; None where that is one hypothesis.
 
-    Looked for are runs with the apparatus' own velocities, loads and modulations, and up to twice beyond them.
+    Looked for are runs with the apparatus' own velocities, loads and modulations, and up to twice beyond them: so many are
+    `tried`, and so many of the best are `varied`.
     """
     sides = foremost(diagnosis)
     if diagnosis.verdict != "ambiguous" or len(sides) < 2:
         return None
-    return Design(diagnosis.experiment, sides, seed).best()
+    return Design(diagnosis.experiment, sides, seed).best(tried, varied)
 
 
 def foremost(diagnosis: Diagnosis) -> tuple[Side, ...]:
@@ -204,13 +207,13 @@ class Design:
         self.rng = np.random.default_rng(seed)
         self.tried = 0
 
-    def best(self) -> DiscriminatingRun | None:
-        """Return the best run, None where no model can be followed through any."""
-        looked = self.look(draw(self.apparatus, CANDIDATE_RUNS, self.rng), LOOKED)
+    def best(self, tried: int, varied: int) -> DiscriminatingRun | None:
+        """Return the best run of so many, and of variations of it; None where no model can be followed through any."""
+        looked = self.look(draw(self.apparatus, tried, self.rng), LOOKED)
         if not looked:
             return None
-        near = vary(looked[0].proposal, self.apparatus, VARIATIONS, self.rng)
-        looked = sorted([*looked, *self.look(near, VARIATIONS, above=looked[0].gain)], key=lambda t: -t.gain)
+        near = vary(looked[0].proposal, self.apparatus, varied, self.rng)
+        looked = sorted([*looked, *self.look(near, varied, above=looked[0].gain)], key=lambda t: -t.gain)
         best: DiscriminatingRun | None = None
         for trial in looked[:CONFIRMED]:
             found = self.judge(trial)

@@ -33,6 +33,7 @@ from srfcli.inference.state_space import (
     FARTHEST_STEP,
     FIELD,
     HOPELESS,
+    MANY_READINGS,
     NEEDED,
     NOT_CONVERGED,
     TRIAL_STEPS,
@@ -168,7 +169,7 @@ class ModelSearch:
     ) -> None:
         self.registry, self.whole, self._told = registry, experiment, progress
         self.trend = trend or experiment.trend  # of every fit
-        self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs))
+        self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs, self.options.get("many", MANY_READINGS)))
         self.candidates, self.excluded = applicable(registry, experiment, effects)
         every = [effect for e in registry.entries("effect") if isinstance(effect := registry.load(e), Effect)]
         self.on_request = [e.name for e in every if effects is None and e.on_request]

@@ -33,7 +33,7 @@ MODIFIER = "linker-dieterich"
 SIZES = {"alpha": 0.2, "lambda": 0.1, "n": 0.1}  # that one would want to see: of rock's alpha, of lambda's own value, of n
 OTHER_MOTION = 3.0  # rms of simulation minus recording over the recording's own spread, from which it is another motion
 STIFFER = 1.5  # from half to twice the stated stiffness
-MOST_SIMULATED = 20_000  # samples of a run that are simulated; of more, evenly chosen blocks stand for the others
+MOST_SIMULATED = 20_000  # samples of a run that are simulated
 NOISE_BLOCK = 16  # samples of one: the first half tells what the noise is like there, the second half counts
 UNDETERMINED = 100.0  # an error beyond this tells nothing: alpha and n are of order 1, lambda counts relative to itself
 
@@ -98,17 +98,19 @@ def forecast(
     *,
     registry: Registry,
     apparatus: bool = True,
+    most: int = MOST_SIMULATED,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Forecast:
     """Return what these runs of an experiment could tell at best; raises SrfError where its model cannot be built.
 
     Stiffness and trends are unknown, too, unless `apparatus` is False: then it is a fit of the experiment's own free parameters.
+    Of each run `most` samples are simulated, or fewer; of a longer one evenly chosen blocks stand for the others.
     """
     question = _question(experiment, checks, registry, apparatus)
     runs, fitted = [], []
     for check in checks:
         progress(check.run.name)
-        told = _simulated(question, check)
+        told = _simulated(question, check, most)
         errors, peaks = _errors(question, [told])
         name, holdout = check.run.name, check.run.holdout
         one = CramerRaoBound(name, holdout, _variation([check]), errors, peaks, told.misfit, told.status, told.reached)
@@ -184,9 +186,9 @@ class _Told:
     reached: float
 
 
-def _simulated(question: _Question, check: RunCheck) -> _Told:
+def _simulated(question: _Question, check: RunCheck, most: int) -> _Told:
     model, run = question.model, check.run
-    chosen, weight = _chosen(run.t.size)
+    chosen, weight = _chosen(run.t.size, most)
     short = replace(run, t=run.t[chosen], observed=run.observed[chosen], used=run.used[chosen])
     values, own = dict(question.values), own_names(model, short, question.trend)
     p, ranges = run_parameters(model, question.experiment, short, values), []
@@ -209,11 +211,11 @@ def _simulated(question: _Question, check: RunCheck) -> _Told:
     return _Told(F, Z, misfit, found.status, float(found.reached))
 
 
-def _chosen(size: int) -> tuple[NDArray[np.int64], float]:
+def _chosen(size: int, most: int) -> tuple[NDArray[np.int64], float]:
     """Return which samples of a run are simulated, and how many each that counts stands for: all, or blocks of a long one."""
-    if size <= MOST_SIMULATED:
+    if size <= most:
         return np.arange(size), 1.0
-    first = np.linspace(0, size - NOISE_BLOCK, MOST_SIMULATED // NOISE_BLOCK).astype(int)
+    first = np.linspace(0, size - NOISE_BLOCK, most // NOISE_BLOCK).astype(int)
     return (first[:, None] + np.arange(NOISE_BLOCK)).ravel(), size / (first.size * NOISE_BLOCK / 2)
 
 

@@ -1137,13 +1137,14 @@ def fit_state_space(
     least: float = -np.inf,
     close: float = CONVERGED,
     rtol: float = FILTER_RTOL,
+    many: int = MANY_READINGS,
     progress: Callable[[str], None] = lambda text: None,
 ) -> StateSpaceFit:
     """Return the maximum-likelihood fit of parameters, random friction field and gauge noise, `close` standard errors or nearer.
 
     From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
-    More than MANY_READINGS are fitted in two steps: every so-many-th of them, then all from there; `part` is the first step's fit
-    where it is known.
+    More than `many` readings are fitted in two steps: every so-many-th of them, then all from there; `part` is the fit of the
+    first step where it is known.
     `smooth` says whether there is no field; left out, there is one where it gains 2 in log likelihood. `processes` says which
     of coloured noise the gauge has, words of PROCESSES; left out, Schwarz's criterion decides, early and, if the fit is to be
     `thorough`, again at the maximum; where it is `cautious`, more than one only if innovations are correlated all along, as those
@@ -1160,8 +1161,9 @@ def fit_state_space(
         "smooth": smooth, "processes": processes, "cautious": cautious, "close": close, "progress": progress,
     }  # fmt: skip
     try:
-        if part is None and start is None and (runs := thinned(problem.runs)) is not problem.runs:
-            part = fit_state_space(replace(problem, runs=runs), thorough=thorough, beside=beside, rtol=rtol, **choice)
+        if part is None and start is None and (runs := thinned(problem.runs, many)) is not problem.runs:
+            rest = replace(problem, runs=runs)
+            part = fit_state_space(rest, thorough=thorough, beside=beside, rtol=rtol, many=many, **choice)
         if not problem.runs:  # there is neither field nor gauge
             own = likelihood(True, ())
             found = StateSpaceFit(own, maximise(own, own.coordinates(start or {}), close=close, progress=progress))
@@ -1211,11 +1213,11 @@ def stopped(problem: Problem, found: StateSpaceFit | None) -> StateSpaceFit:
     return StateSpaceFit(likelihood, Maximum(point, np.inf, Status.INTERRUPTED, inverse(point.information)), 1)
 
 
-def thinned(runs: tuple[Run, ...]) -> tuple[Run, ...]:
-    """Return the runs with MANY_READINGS readings at most; the same runs where they have no more."""
-    if sum(run.t.size for run in runs) <= MANY_READINGS:
+def thinned(runs: tuple[Run, ...], many: int = MANY_READINGS) -> tuple[Run, ...]:
+    """Return the runs with so `many` readings at most; the same runs where they have no more."""
+    if sum(run.t.size for run in runs) <= many:
         return runs
-    return tuple(run.thinned(-(-run.t.size * len(runs) // MANY_READINGS)) for run in runs)
+    return tuple(run.thinned(-(-run.t.size * len(runs) // many)) for run in runs)
 
 
 def _carried(found: StateSpaceFit, likelihood: Likelihood) -> dict[str, float]:
@@ -1322,7 +1324,12 @@ def _fitted(
 
 
 def from_any(rough: Likelihood, starts: Iterable[Array], steps: int, progress: Callable[[str], None]) -> Maximum | None:
-    """Return the maximum from the first start that leads near one, or the likeliest that was reached from all.
+    """Return the maximum from the first start that leads near one, or the likeliest that was reached from all."""
+    return likeliest_end(rough, ((x, maximise(rough, x, steps=steps, close=1.0, progress=progress)) for x in starts))
+
+
+def likeliest_end(rough: Likelihood, ends: Iterable[tuple[Array, Maximum]]) -> Maximum | None:
+    """Return the first of several ends, each with its start, that is near a maximum, or the likeliest of them.
 
     Under a field that is no narrower than the start's the filter follows the recordings whatever the parameters are: these may
     have drifted to where no step leads back, and another start is tried. One more is, too, where a parameter is at its bound.
@@ -1330,8 +1337,7 @@ def from_any(rough: Likelihood, starts: Iterable[Array], steps: int, progress: C
     found: Maximum | None = None
     bounded = False
     at = rough.names.index("field_amplitude")
-    for x in starts:
-        other = maximise(rough, x, steps=steps, close=1.0, progress=progress)
+    for x, other in ends:
         if found is None or other.point.log_likelihood > found.point.log_likelihood:
             found = other
         y = other.point.x

@@ -7,7 +7,7 @@ V; and the smallest amplitude at which a line meets more than one boundary (re-e
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -249,7 +249,8 @@ def join_study(task: LawTask, found: Mapping[LawPart, dict[str, Array]]) -> LawS
     mapped = {part.eps: arrays for part, arrays in found.items() if part.mapped}
     rows = [mapped[eps] for eps in task.amplitudes]
     several = {part.eps: bool(arrays["several"]) for part, arrays in found.items()}
-    onset, end = _reentrance(tile_model(task.source, task.key), task, several)
+    model = tile_model(task.source, task.key)
+    onset, end = reentrance(several, lambda eps: _there(model, task, eps), within=task.onset)
     return LawStudy(
         tuple(row["crossings"] for row in rows),
         tuple(tuple(np.split(row["curves"], np.cumsum(row["sizes"])[:-1])) if row["sizes"].size else () for row in rows),
@@ -325,19 +326,19 @@ def _there(model: GeneratedModel, task: LawTask, eps: float) -> bool:
     return any(_reentrant(curves, task.window) for curves in found)
 
 
-def _reentrance(
-    model: GeneratedModel, task: LawTask, known: Mapping[float, bool]
+def reentrance(
+    known: Mapping[float, bool], there: Callable[[float], bool], *, within: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the brackets of the amplitudes at which re-entrance begins, and is gone again; see LawStudy.
+    """Return the brackets, no wider than `within`, of the amplitudes at which re-entrance begins, and is gone again.
 
-    `known` says of amplitudes, no farther apart than the task's stride, whether it is there.
+    `known` says of amplitudes, from which they are sought, whether it is there, and `there` says so of any. See LawStudy.
     """
 
     def halved(low: float, high: float) -> tuple[float, float]:
         after = known[high]
-        while high - low > task.onset:
+        while high - low > within:
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if _there(model, task, middle) == after else (middle, high)
+            low, high = (low, middle) if there(middle) == after else (middle, high)
         return low, high
 
     brackets: list[tuple[float, float]] = []
