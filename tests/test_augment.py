@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,8 +17,7 @@ from recording_cases import write
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment, FitParameter, ModelChoice
-from srfcli.diagnosis import augment as augmenting
-from srfcli.diagnosis.augment import MergedLaws, augment, law_files, merge
+from srfcli.diagnosis.augment import Augmented, MergedLaws, augment, law_files, merge
 from srfcli.diagnosis.hypotheses import Hypothesis
 from srfcli.laws.registry import load_registry
 from srfcli.laws.values import Effect
@@ -129,12 +129,16 @@ def fitted(experiment: Experiment, **values: tuple[float, float, float, str]) ->
 
 def written(experiment: Experiment, names: tuple[str, ...], fit: Any, folder: Path) -> tuple[Experiment, Any]:
     found = augment(REGISTRY, experiment, Hypothesis(tuple(effects(*names))), fit, folder=folder)
+    return placed(found, folder), found
+
+
+def placed(found: Augmented, folder: Path) -> Experiment:
     folder.mkdir()
     for name, text in found.files.items():
         (folder / name).write_text(text, encoding="utf-8")
     for name, path in found.copies.items():
         (folder / name).write_bytes(path.read_bytes())
-    return read_experiment(folder, registry=REGISTRY), found
+    return read_experiment(folder, registry=REGISTRY)
 
 
 def test_the_recordings_are_the_same(experiment: Experiment, tmp_path: Path) -> None:
@@ -197,11 +201,13 @@ def test_an_effect_of_ones_own_goes_along(experiment: Experiment, tmp_path: Path
     assert [Path(e).name for e in again.choice.effects] == ["effect-dust.toml"]
 
 
-def test_large_recordings_are_named_where_they_are(
-    experiment: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(augmenting, "COPIED_BYTES", 10)
-    again, found = written(experiment, (), fitted(experiment), tmp_path / "new")
+def test_large_recordings_are_named_where_they_are(experiment: Experiment, tmp_path: Path) -> None:
+    (recording,) = tmp_path.glob("recorded/one.csv")
+    size = recording.stat().st_size
+    os.truncate(recording, 2**29)  # half a gigabyte of nothing, which takes no room
+    found = augment(REGISTRY, experiment, Hypothesis(), fitted(experiment), folder=tmp_path / "new")
+    os.truncate(recording, size)
+    again = placed(found, tmp_path / "new")
     assert found.copies == {} and "../recorded/" in found.files["experiment.toml"]
     assert [r.t.size for r in again.runs] == [r.t.size for r in experiment.runs]
 

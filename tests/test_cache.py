@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from uuid import uuid4
 
 import pytest
 from click.testing import CliRunner
@@ -136,75 +137,71 @@ POSIX = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="no owners and mod
 
 
 @pytest.fixture
-def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing in memory, and no warning told yet."""
-    monkeypatch.setattr(cache, "_memory", {})
-    cache._warn.cache_clear()
+def key() -> str:
+    """A key that nothing in memory has."""
+    return uuid4().hex
 
 
-def kept_nowhere(folder: Path, caplog: pytest.LogCaptureFixture, said: str) -> None:
+def kept_nowhere(folder: Path, key: str, caplog: pytest.LogCaptureFixture, said: str) -> None:
     """The cache is refused with one warning, what lies there is not read, and memory stands in for it."""
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     with caplog.at_level(logging.WARNING, "srfcli"):
         for _ in range(3):
-            assert cached_source("k", lambda: TEXT) == TEXT
-        assert cached_source("k", never) == TEXT
+            assert cached_source(key, lambda: TEXT) == TEXT
+        assert cached_source(key, never) == TEXT
     assert len(caplog.messages) == 1 and said in caplog.messages[0]
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
 
 
 @POSIX
-@pytest.mark.usefixtures("fresh")
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o707, 0o1777])
-def test_a_folder_that_others_may_write_to_is_refused(folder: Path, caplog: pytest.LogCaptureFixture, mode: int) -> None:
-    cached_source("k", lambda: "evil = 1\n")
+def test_a_folder_that_others_may_write_to_is_refused(
+    folder: Path, key: str, caplog: pytest.LogCaptureFixture, mode: int
+) -> None:
+    cached_source(key, lambda: "evil = 1\n")
     folder.chmod(mode)
-    kept_nowhere(folder, caplog, f"others may write to {folder}")
+    kept_nowhere(folder, key, caplog, f"others may write to {folder}")
 
 
 @POSIX
-@pytest.mark.usefixtures("fresh")
 def test_a_folder_that_others_may_replace_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, key: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
     monkeypatch.setenv("SRF_CACHE", str(tmp_path / "open" / "cache"))
-    kept_nowhere(tmp_path / "open", caplog, "others may replace")
+    kept_nowhere(tmp_path / "open", key, caplog, "others may replace")
 
 
 @POSIX
-@pytest.mark.usefixtures("fresh")
-def test_a_folder_of_another_is_refused(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    cached_source("k", lambda: "evil = 1\n")
+def test_a_folder_of_another_is_refused(folder: Path, key: str, caplog: pytest.LogCaptureFixture) -> None:
+    cached_source(key, lambda: "evil = 1\n")
     try:
         os.chown(folder, os.geteuid() + 1, -1)
     except PermissionError:
         pytest.skip("only root can give a folder away")
-    kept_nowhere(folder, caplog, "belongs to another user")
+    kept_nowhere(folder, key, caplog, "belongs to another user")
 
 
 @POSIX
-@pytest.mark.usefixtures("fresh")
 @pytest.mark.parametrize("harm", ["open", "short", "link", "fifo"])
 def test_a_secret_that_is_not_the_users_alone_is_refused(
-    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, harm: str
+    folder: Path, key: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, harm: str
 ) -> None:
-    cached_source("k", lambda: "evil = 1\n")
-    key = tmp_path / "state" / "srf" / "cache.key"
-    assert key.stat().st_mode & 0o777 == 0o600 and key.stat().st_size == 32
+    cached_source(key, lambda: "evil = 1\n")
+    secret = tmp_path / "state" / "srf" / "cache.key"
+    assert secret.stat().st_mode & 0o777 == 0o600 and secret.stat().st_size == 32
     if harm == "open":
-        key.chmod(0o644)
+        secret.chmod(0o644)
     elif harm == "short":
-        key.write_bytes(b"")
+        secret.write_bytes(b"")
     else:
-        key.rename(tmp_path / "moved")
-        key.symlink_to(tmp_path / "moved") if harm == "link" else os.mkfifo(key, 0o600)
-    kept_nowhere(folder, caplog, "cache.key")
+        secret.rename(tmp_path / "moved")
+        secret.symlink_to(tmp_path / "moved") if harm == "link" else os.mkfifo(secret, 0o600)
+    kept_nowhere(folder, key, caplog, "cache.key")
 
 
-@pytest.mark.usefixtures("fresh")
 def test_a_forged_entry_never_runs(folder: Path, tmp_path: Path) -> None:
     evil = "raise SystemExit('forged')\n"
     cached_source("k", lambda: TEXT)
@@ -228,7 +225,6 @@ def test_a_forged_entry_never_runs(folder: Path, tmp_path: Path) -> None:
         assert cached_source("k", never) == TEXT
 
 
-@pytest.mark.usefixtures("fresh")
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
 def test_a_forged_library_is_never_loaded(folder: Path, tmp_path: Path, make_model, monkeypatch) -> None:
     command = compiler()
@@ -291,7 +287,6 @@ def built(tmp_path_factory: pytest.TempPathFactory, make_model) -> Path:
     return folder
 
 
-@pytest.mark.usefixtures("fresh")
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize(
     "how", ["as it was", *(pytest.param(h, marks=pytest.mark.slow) for h in ("of another name", "not to be written"))]
@@ -319,16 +314,18 @@ def test_a_method_that_is_not_this_user_s_is_compiled_anew(
 
 
 @POSIX
-@pytest.mark.usefixtures("fresh", "empty_folder")
-def test_a_command_says_once_that_nothing_is_cached(folder: Path) -> None:
-    folder.mkdir()
-    folder.chmod(0o777)
+@pytest.mark.usefixtures("empty_folder")
+def test_a_command_says_once_that_nothing_is_cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for more, said in ((), 1), (("-q",), 0):
-        cache._warn.cache_clear()
+        folder = tmp_path / f"cache{said}"
+        folder.mkdir()
+        folder.chmod(0o777)
+        monkeypatch.setenv("SRF_CACHE", str(folder))
         done = CliRunner().invoke(cli, ["linear", "--law", "dieterich-ruina", "--interface", "rigid", *more], prog_name="srf")
         assert done.exit_code == 0, done.output
         assert done.stderr.count("Warning: nothing is cached: others may write to") == said
-    assert not list(folder.iterdir())
+        assert not list(folder.iterdir())
 
 
 def test_relative_folders_of_the_desktop_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
