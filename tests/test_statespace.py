@@ -577,15 +577,16 @@ def test_ctrl_c_keeps_the_likeliest_point_and_says_so(make_model, many):
     assert all(np.isfinite(list(kept.stderr.values())))
 
 
-def test_one_more_start_is_tried_where_a_parameter_went_to_its_bound(make_model):
+def test_one_more_start_is_tried_where_a_parameter_went_to_its_bound_or_the_field_stayed_wide(make_model):
     problem = fit_problem(make_model(**ROCK, random_field=True), made(make_model(**ROCK, tables=(("mu", "slip"),)), 6, 1e-3))
     rough = Likelihood(problem)
-    at, narrower = rough.names.index("field_amplitude"), rough.start.copy()
-    narrower[at] -= 1.0
-    point = rough.at(narrower)
+    x = rough.start.copy()
+    x[rough.names.index("field_amplitude")] = np.log(0.8e-3 * 0.6)  # of the friction
+    faint = rough.at(x)
+    wide = rough.at(rough.start)
 
-    def led(bounded, height):
-        x = narrower.copy()
+    def led(bounded, height, point=faint):
+        x = point.x.copy()
         x[0] = rough.lower[0] if bounded else x[0]
         return Maximum(replace(point, x=x, log_likelihood=height), 0.5, Status.OK, np.zeros((x.size, x.size)))
 
@@ -593,8 +594,10 @@ def test_one_more_start_is_tried_where_a_parameter_went_to_its_bound(make_model)
         ([led(False, 1.0), led(False, 9.0)], 1, 1.0),
         ([led(True, 1.0), led(False, 2.0), led(False, 9.0)], 2, 2.0),
         ([led(True, 3.0), led(True, 2.0), led(False, 9.0)], 2, 3.0),
+        ([led(False, 3.0, wide), led(False, 2.0), led(False, 9.0)], 2, 3.0),
+        ([led(False, 1.0, wide), led(False, 2.0, wide)], 2, 2.0),
     ):
-        left = iter([(rough.start, end) for end in ends])
+        left = iter(ends)
         found = likeliest_end(rough, left)
         assert len(list(left)) == len(ends) - count and found.point.log_likelihood == best
 

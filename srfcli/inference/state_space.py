@@ -52,7 +52,7 @@ FILTER_RTOL = 1e-4  # each reading puts right what the integration got wrong bef
 FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
 # Fields under which a fit begins: amplitude over friction, length over the longest slip / LENGTHS_IN_SLIP. One after the other,
-# while none leads near a maximum under a field that is narrower than it was
+# while none leads near a maximum under a faint field
 WIDE = ((0.01, 3.0), (0.01, 10.0), (0.003, 1.0), (0.3, 1.0))
 SHORT = (1.0, 0.25, 0.06)  # lengths of faint fields that are tried, over the same
 NOT_CONVERGED = 3.0  # standard errors from its maximum at which a fit is none
@@ -83,7 +83,7 @@ LOST_CURVATURE = 0.5  # share of what derivatives want at a probe, below which t
 RIDGE_STRIDE, RIDGE_REACH = 0.05, 0.5  # of a parameter, where maxima beside one are looked for, and how far a probe may go
 DOWN = 10.0  # in log likelihood, by how much less likely than without a field a faint one may be and be averaged over
 NEIGHBOUR_STEPS = (16, 64)  # of two standard errors to either side, least and most, in which other maxima are looked for
-HOPS = 4  # from one maximum to a likelier one beside it
+HOPS = 16  # from one maximum to a likelier one beside it, at most: from start values 30 % off eight strides, each a hop or two
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 UNFELT = 1e-6  # twice the log likelihood that a parameter changes between its bounds, below which its score is rounding
 FARTHEST_UPDATE = 3.0  # by a reading of ln v and ln PHI, a factor of 20 in v and PHI; standard deviations of the field
@@ -1325,24 +1325,25 @@ def _fitted(
 
 def from_any(rough: Likelihood, starts: Iterable[Array], steps: int, progress: Callable[[str], None]) -> Maximum | None:
     """Return the maximum from the first start that leads near one, or the likeliest that was reached from all."""
-    return likeliest_end(rough, ((x, maximise(rough, x, steps=steps, close=1.0, progress=progress)) for x in starts))
+    return likeliest_end(rough, (maximise(rough, x, steps=steps, close=1.0, progress=progress) for x in starts))
 
 
-def likeliest_end(rough: Likelihood, ends: Iterable[tuple[Array, Maximum]]) -> Maximum | None:
-    """Return the first of several ends, each with its start, that is near a maximum, or the likeliest of them.
+def likeliest_end(rough: Likelihood, ends: Iterable[Maximum]) -> Maximum | None:
+    """Return the first of several ends that is near a maximum under a faint field, or the likeliest of them.
 
-    Under a field that is no narrower than the start's the filter follows the recordings whatever the parameters are: these may
-    have drifted to where no step leads back, and another start is tried. One more is, too, where a parameter is at its bound.
+    Under a field that does not become faint the filter follows the recordings whatever the parameters are: these may have drifted
+    to where no step leads back, and another start is tried. One more is, too, where a parameter is at its bound.
     """
     found: Maximum | None = None
     bounded = False
     at = rough.names.index("field_amplitude")
-    for x, other in ends:
+    faint = rough.lower[at] + np.log(FAINT_FIELD / LEAST_FIELD)
+    for other in ends:
         if found is None or other.point.log_likelihood > found.point.log_likelihood:
             found = other
         y = other.point.x
         inside = not rough.at_bounds(y)
-        if other.away < NOT_CONVERGED and y[at] < x[at] and (inside or bounded):
+        if other.away < NOT_CONVERGED and y[at] < faint and (inside or bounded):
             break
         bounded = bounded or not inside
     return found
