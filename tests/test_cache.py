@@ -114,6 +114,21 @@ def test_a_changed_law_is_derived_anew(folder: Path, tmp_path: Path) -> None:
     law.write_text(law.read_text().replace("mu0 + A*log(v/V0)", "mu0 + 2*A*log(v/V0)"))
     assert friction() > before + 0.01
     assert len(list(folder.iterdir())) == 2
+    # as a file it is derived once, wherever it lies; one without a name has its file's
+    for place in ("one", "other"):
+        (tmp_path / place).mkdir()
+        text = law.read_text().replace('name = "mine"', "")
+        (tmp_path / place / "mine.toml").write_text(text)
+        (tmp_path / place / f"{place}.toml").write_text(text)
+    titles = [
+        open_model(load_registry(), law=str(tmp_path / place / "mine.toml"), stability=False).title for place in ("one", "other")
+    ]
+    assert titles[0] == titles[1] and len(list(folder.iterdir())) == 3
+    titles = [
+        open_model(load_registry(), law=str(tmp_path / place / f"{place}.toml"), stability=False).title
+        for place in ("one", "other")
+    ]
+    assert [title.split(",")[0] for title in titles] == ["one", "other"] and len(list(folder.iterdir())) == 5
 
 
 def test_a_second_start_imports_no_sympy(folder: Path) -> None:

@@ -153,7 +153,8 @@ def open_model(
     parts += ["stability"] if effects and stability else []
     for kind, name in wanted:
         found, fingerprint = _source(registry, kind, name.strip())
-        parts += [kind, name, fingerprint]
+        # a law's file says all of it, wherever it lies; a Python file may import from beside it
+        parts += [kind, Path(name).name if name.endswith(".toml") else name, fingerprint]
         laws.append(found)
     key = content_key(parts)
 
