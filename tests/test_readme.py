@@ -1,6 +1,7 @@
 """README and docs hold: every ```console command runs in an empty folder, and prints what is shown below it.
 
 Commands see the extras that README installs and no others; a page that needs more says so: `<!-- extras: sample -->`.
+`srf` starts anew for each command of README; for those of docs/ a process that holds its modules forks (srf_server.py).
 Before a block, `<!-- digits: 2 -->` says how far its numbers are compared, `<!-- slow -->` that it runs with --runslow alone.
 """
 
@@ -13,7 +14,8 @@ import shlex
 import subprocess
 import sys
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -134,6 +136,30 @@ def environment(tmp_path: Path) -> dict[str, str]:
     return {**kept, "PATH": path, "PYTHONPATH": paths, "XDG_DATA_HOME": str(tmp_path / "data"), "COLUMNS": "100"}
 
 
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[set[str]], str]]:
+    """Return the shim of an `srf` that sees some libraries as absent; its server runs until the last test has ended."""
+    shims: dict[frozenset[str], str] = {}
+
+    def shim(names: set[str]) -> str:
+        key = frozenset(names)
+        if key not in shims:
+            folder = tmp_path_factory.mktemp("srf")
+            environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
+            hide(names, environment)
+            server, place = str(ROOT / "tests" / "srf_server.py"), str(folder / "s")
+            process = subprocess.Popen(
+                [sys.executable, server, place], env=environment, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            )
+            running.callback(process.communicate)  # its standard input ends
+            assert process.stdout is not None and process.stdout.readline() == "ready\n"
+            shims[key] = f'#!/bin/sh\nexec {shlex.join([sys.executable, "-IS", server, place])} "$@"\n'
+        return shims[key]
+
+    with ExitStack() as running:
+        yield shim
+
+
 def hide(names: set[str], environment: Mapping[str, str]) -> None:
     """Make libraries look as if they were not installed to every Python of this environment."""
     folder = Path(environment["PYTHONPATH"].partition(os.pathsep)[0])
@@ -142,12 +168,15 @@ def hide(names: set[str], environment: Mapping[str, str]) -> None:
 
 @pytest.mark.parametrize("path", [p for p in DOCUMENTS if examples(p)], ids=lambda p: p.name)
 def test_commands_print_what_is_shown(
-    path: Path, environment: dict[str, str], tmp_path: Path, request: pytest.FixtureRequest
+    path: Path, environment: dict[str, str], served: Callable[[set[str]], str], tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     folder = tmp_path / "empty"
     folder.mkdir()
     (folder / "examples").symlink_to(ROOT / "examples")
-    hide(hidden(path.read_text(encoding="utf-8")), environment)
+    names = hidden(path.read_text(encoding="utf-8"))
+    hide(names, environment)
+    if path.name != "README.md":
+        (tmp_path / "bin" / "srf").write_text(served(names), encoding="utf-8")
     for example in examples(path):
         if example.slow and not request.config.getoption("--runslow"):
             continue
