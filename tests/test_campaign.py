@@ -93,7 +93,7 @@ def test_of_what_varies_a_row_has_the_mean_and_says_so() -> None:
     experiment("one", seed=1)
     text = Path("one/experiment.toml").read_text(encoding="utf-8").replace("inertia = false", 'inertia = false\nvary = ["B"]')
     run = text[text.index("[[runs]]") :]
-    shutil.copy("one/a.csv", "one/b.csv")
+    shutil.copy(experiment("two", seed=2) / "a.csv", "one/b.csv")
     Path("one/experiment.toml").write_text(text + run.replace('"a"', '"b"').replace("a.csv", "b.csv"), encoding="utf-8")
     srf("fit", "one", "--table", "out.csv", "--track", "smooth")
     row = rows_of(Path("out.csv"))["one"]

@@ -200,11 +200,11 @@ def test_stiffness_and_trends_are_unknown_too_and_cost_what_they_cost_a_fit(made
     assert "K, a trend of each run unknown" in srf("check", str(made)).stdout
 
 
-@pytest.mark.parametrize(("name", "case"), [("onset", "open-01"), ("strong", "open-01"), ("loadstep", "open-01")])
-def test_errors_from_differences(name: str, case: str, shared: Path) -> None:
+@pytest.mark.parametrize("name", ["strong", "loadstep"])
+def test_errors_from_differences(name: str, shared: Path) -> None:
     """alpha and lambda with all else known, from simulations at two values each: within a factor of 1.1, where a linear
     response of the contact is wrong by ten."""
-    experiment = read_experiment(shared / "cases" / case, registry=REGISTRY)
+    experiment = read_experiment(shared / "cases" / "open-01", registry=REGISTRY)
     fixed = replace(experiment, parameters=tuple(replace(p, fixed=True) for p in experiment.parameters))
     run = next(r for r in experiment.runs if r.name == name)
     check = check_run(run)
@@ -238,6 +238,7 @@ def test_a_constant_load_cannot_tell_alpha(shared: Path) -> None:
 
 def test_bounds_and_free_starts_cost_what_they_must(made: Path) -> None:
     experiment = read_experiment(made, registry=REGISTRY)
+    experiment = replace(experiment, runs=experiment.runs[:1])
     base = told(experiment).runs[0].errors
     known = replace(experiment, parameters=tuple(replace(p, fixed=True) for p in experiment.parameters))
     narrow = tuple(
@@ -253,8 +254,9 @@ def test_bounds_and_free_starts_cost_what_they_must(made: Path) -> None:
 
 def test_a_long_run_is_thinned_without_another_answer(made: Path) -> None:
     experiment = read_experiment(made, registry=REGISTRY)
-    whole = told(experiment).runs[1].errors
-    thin = told(experiment, most=900).runs[1].errors
+    experiment = replace(experiment, runs=experiment.runs[1:])
+    whole = told(experiment).runs[0].errors
+    thin = told(experiment, most=900).runs[0].errors
     assert thin != whole
     for name in whole:  # what a step of the load makes takes a few samples, of which blocks have more or fewer
         assert thin[name] == pytest.approx(whole[name], rel=0.3)

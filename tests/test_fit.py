@@ -141,9 +141,15 @@ def test_a_free_start_is_observed_where_it_should_be(rock_model):
 
 
 @pytest.fixture(scope="module")
-def recovered(rock_model):
+def whole(rock_model):
+    """The fit to white noise."""
+    return fit_state_space(fit_problem(rock_model, rock(rock_model)), smooth=True)
+
+
+@pytest.fixture(scope="module")
+def recovered(rock_model, whole):
     """Fits to white noise and to noise of a lag-one correlation of 0.9, by this."""
-    return {lag: fit(fit_problem(rock_model, rock(rock_model, lag=lag))) for lag in (0.0, 0.9)}
+    return {0.0: as_fit(whole), 0.9: fit(fit_problem(rock_model, rock(rock_model, lag=0.9)))}
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.9])
@@ -169,27 +175,24 @@ def test_errors_are_those_of_repeats(rock_model):
     assert np.mean(np.abs(z) < 1.96) > 0.85
 
 
-def test_profile_of_a_nearly_linear_parameter(rock_model):
-    problem = fit_problem(rock_model, rock(rock_model))
-    found = fit_state_space(problem, smooth=True)
-    interval = profile(found, "mu0")
-    half = 1.96 * as_fit(found).stderr["mu0"]
-    assert interval.high - found.values["mu0"] == pytest.approx(half, rel=0.05)
-    assert found.values["mu0"] - interval.low == pytest.approx(half, rel=0.05)
+def test_profile_of_a_nearly_linear_parameter(whole):
+    interval = profile(whole, "mu0")
+    half = 1.96 * as_fit(whole).stderr["mu0"]
+    assert interval.high - whole.values["mu0"] == pytest.approx(half, rel=0.05)
+    assert whole.values["mu0"] - interval.low == pytest.approx(half, rel=0.05)
 
 
-def test_a_profile_says_where_a_refit_is_likelier_than_the_fit(rock_model):
+def test_a_profile_says_where_a_refit_is_likelier_than_the_fit(whole):
     """A fit that was broken off stands below the maximum; one at its maximum has nothing likelier beside it."""
-    problem = fit_problem(rock_model, rock(rock_model))
-    whole = fit_state_space(problem, smooth=True)
-    assert profile(whole, "A").likelier is None
+    at_its_maximum = profile(whole, "A")
+    assert at_its_maximum.likelier is None
     own, truth = whole.likelihood, whole.maximum.point.x
     far = truth + np.sqrt(np.diag(whole.maximum.covariance)) * np.where(np.arange(truth.size) == own.names.index("D0"), 3.0, 0.0)
     broken = StateSpaceFit(own, replace(whole.maximum, point=own.at(far)))
     interval = profile(broken, "A")
     assert interval.gain == pytest.approx(whole.log_likelihood - broken.log_likelihood, abs=2.0) and interval.gain > 2
     assert interval.likelier["D0"] == pytest.approx(whole.values["D0"], rel=0.1)
-    (said,) = said_likelier([profile(whole, "A"), interval], lambda name, x: ("um" if name == "D0" else "1", [x]))
+    (said,) = said_likelier([at_its_maximum, interval], lambda name, x: ("um" if name == "D0" else "1", [x]))
     assert "in the profile of A, is likelier by" in said and f"D0 = {interval.likelier['D0']:.5g}" in said
 
 
