@@ -30,15 +30,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 # Files of long tests, by their time: what takes longest is begun first, so that no worker is left alone with it at the end.
 LONG = (
-    "test_readme.py", "test_proof_generator.py", "test_new.py", "test_effects.py", "test_discriminating.py",
-    "test_threshold_experiments.py", "test_prove.py", "test_same_bytes.py", "test_proof_bank.py", "test_model_search.py",
-    "test_unknown.py", "test_api.py", "test_fit.py", "test_observables.py", "test_fit_rough.py", "test_notebooks.py",
-    "test_diagnose_command.py", "test_hostile_files.py", "test_report.py", "test_stress.py", "test_check.py",
-    "test_cli_commands.py", "test_recording_flaws.py", "test_simulate_command.py", "test_load_oscillations.py",
-    "test_statespace.py", "test_equations.py", "test_cache.py", "test_site.py", "test_compare.py",
-    "test_one_run.py", "test_sample.py", "test_derive.py", "test_thresholds.py", "test_brute_force.py", "test_generate.py",
-    "test_campaign.py", "test_motion.py", "test_kills.py", "test_effect_plugins.py", "test_escapes.py", "test_parallel.py",
-    "test_paper.py", "test_readers.py", "test_packaging.py", "test_without_compiler.py",
+    "test_readme.py", "test_model_search.py", "test_fit_rough.py", "test_unknown.py", "test_misstated.py", "test_new.py",
+    "test_threshold_experiments.py", "test_notebooks.py", "test_report.py", "test_discriminating.py", "test_prove.py",
+    "test_statespace.py", "test_api.py", "test_diagnose_command.py", "test_effects.py", "test_cli_commands.py",
+    "test_simulate_command.py", "test_proof_bank.py", "test_kills.py", "test_proof_generator.py", "test_effect_plugins.py",
+    "test_site.py", "test_recording_flaws.py", "test_hostile_files.py", "test_thresholds.py", "test_equations.py",
+    "test_compare.py", "test_stress.py", "test_campaign.py", "test_check.py", "test_brute_force.py", "test_one_run.py",
+    "test_map.py", "test_packaging.py", "test_derive.py", "test_motion.py", "test_readers.py", "test_sample.py",
+    "test_diagram.py", "test_paper.py", "test_parallel.py", "test_windows.py", "test_observables.py", "test_cache.py",
+    "test_generate.py", "test_fit.py", "test_recording_real.py", "test_without_compiler.py", "test_locate.py",
+    "test_escapes.py", "test_folds.py", "test_trust.py", "test_architecture.py", "test_continuation.py",
+    "test_simulate_field.py", "test_cli_frame.py",
 )  # fmt: skip
 
 
