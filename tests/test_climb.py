@@ -35,7 +35,7 @@ def rates(s: Slider, t: float, x: np.ndarray) -> list[float]:
 
 def carried(s: Slider, start: np.ndarray) -> np.ndarray:
     """Return the unknowns a period later."""
-    motion = solve_ivp(lambda t, x: rates(s, t, x), (0, 1 / s.f), start, method="Radau", rtol=1e-10, atol=1e-12)
+    motion = solve_ivp(lambda t, x: rates(s, t, x), (0, 1 / s.f), start, method="LSODA", rtol=1e-10, atol=1e-12)
     return motion.y[:, -1]
 
 

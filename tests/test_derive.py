@@ -248,7 +248,7 @@ def test_text_is_plain_in_a_pipe() -> None:
 
 
 def test_json_holds_every_section() -> None:
-    document = json.loads(run("--format", "json", "--ageing", "nagata", "--loading", "inclined").output)
+    document = json.loads(run("--format", "json", "--ageing", "ruina", "--loading", "inclined").output)
     assert document["schema"] == "srf.derive/1"
     keys = [s["key"] for s in document["sections"]]
     assert keys == ["laws", "steady", "slopes", "equations", "jacobian", "parameters", "dispersion", "limits"]

@@ -57,7 +57,7 @@ def test_sudden_falls_are_fitted_from_a_slider_that_would_not_stick(tmp_path):
     slider = (
         "--law dieterich-ruina --ageing ruina --interface rigid --W0 0.6 --K 0.00744 --set A=0.0127 --set B=0.0184 --set D0=0.07"
     )
-    run = "--set mu0=0.317 --drive 1:3.3,5:1.5,2:4 --rate 250 --noise 0.013 --seed 6"
+    run = "--set mu0=0.317 --drive 0.5:3.3,2:1.5,0.8:4 --rate 250 --noise 0.013 --seed 6"
     words = [*slider.split(), "--M", "3.36e-3 kg", *run.split(), "--free", "mu0,A,B,D0", "--out-dir", str(tmp_path / "made")]
     assert CliRunner().invoke(cli, ["simulate", *words]).exit_code == 0
     experiment = srf.read_experiment(tmp_path / "made")
@@ -108,7 +108,7 @@ def test_parameters_are_those_concealed_within_their_errors(fitted):
 def offset(tmp_path_factory):
     """Three runs under two loads whose mu0 are apart by 2e-3 and -1e-3, one more held out; everything else is alike."""
     folder, rng, base = tmp_path_factory.mktemp("offset"), np.random.default_rng(5), Physics()
-    plans = [Plan(f"up{k}", ((0.6, 20), (0.6, 60)), 4.0 if k == 1 else 3.0, 0.004, holdout=k == 3) for k in range(4)]
+    plans = [Plan(f"up{k}", ((0.6, 20), (0.6, 60)), 4.0 if k == 1 else 3.0, 0.006, holdout=k == 3) for k in range(4)]
     moved = zip(plans, (0.0, 2e-3, -1e-3, 1e-3), strict=True)
     readings = {q: read_gauge(move(replace(base, mu0=base.mu0 + off), q).u, Gauge(), rng) for q, off in moved}
     for name, text in case_files("small", base, readings).items():
@@ -324,7 +324,7 @@ def test_the_likeliest_of_many_maxima_is_found(tmp_path):
 def loud(tmp_path_factory):
     """Three runs whose gauges have noise of 0.02, 0.06 and, held out, 0.12 um; slider and track are alike."""
     folder, rng = tmp_path_factory.mktemp("loud"), np.random.default_rng(8)
-    plans = [Plan(f"up{k}", ((0.6, 20), (0.6, 60)), 3.0, 0.004, holdout=k == 2) for k in range(3)]
+    plans = [Plan(f"up{k}", ((0.6, 20), (0.6, 60)), 3.0, 0.006, holdout=k == 2) for k in range(3)]
     noise = zip(plans, (0.02, 0.06, 0.12), strict=True)
     readings = {q: read_gauge(move(Physics(), q).u, Gauge(sigma=level), rng) for q, level in noise}
     for name, text in case_files("small", Physics(), readings).items():

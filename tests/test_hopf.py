@@ -165,7 +165,7 @@ def test_a_root_has_a_value_where_a_parameter_of_the_rate_is_0(tmp_path):
         'format = "srf-law/1"\nkind = "ageing"\nname = "own"\nrate = "1 - v*phi/D0 - c*phi + n*(1 - v*phi/D0)**2"\n'
         '[parameters]\nn = { default = 0.1 }\nc = { default = 0.1, unit = "1/s" }\n'
     )
-    model = srf.system(ageing=str(path)).model
+    model = srf.system(ageing=str(path), interface="rigid", inertia=False).model
     at = model.states.index("ln_phi")
     for n, c in ((0.0, 0.0), (0.0, 2.0), (0.1, 2.0)):
         x = np.exp(model.steady(model.vector({"V": 10.0, "n": n, "c": c}))[at]) * 10.0 / 0.402

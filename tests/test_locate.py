@@ -47,7 +47,7 @@ def test_noise_alone_is_nowhere() -> None:
 
 
 def test_false_alarms_come_as_often_as_they_should() -> None:
-    pieces = design(n=256)
+    pieces = design(n=128)
     scan = ResidualScan(pieces, 4)
     null, rng = scan.null(400, seed=7), np.random.default_rng(11)
     smallest = []

@@ -112,7 +112,7 @@ def test_a_record_that_begins_with_a_hold_is_fitted(tmp_path: Path) -> None:
     out = tmp_path / "held" / "experiment.toml"
     done = srf("new", tmp_path / "held" / "held.csv", "--stiffness", "0.1 N/um", "--out", out)
     assert "the initial state is estimated, as the drive stands still at first" in done.stderr
-    fitted = json.loads(srf("fit", out, "--json").stdout)
+    fitted = json.loads(srf("fit", out, "--track", "smooth", "--json").stdout)
     assert fitted["status"] == "ok"
     values = {row["parameter"]: (row["value"], row["stderr"]) for row in fitted["rows"]}
     for name, true in {"A": 0.008, "B": 0.011, "D0": 5.0}.items():
@@ -199,7 +199,7 @@ def test_a_declared_modulation_counts_between_samples_that_are_too_few_for_it(tm
     """At 200 Hz a load of 120 Hz looks like one of 80 Hz: the column agrees with both, and the spline through it with none."""
     rig = ("--law", "srf-vsat", "--K", "0.21 N/um", "--W0", 7, "--eps", 0.15, "--onset", 0.2, "--drive", "0.8:8,0.4:16")
     srf("simulate", *rig, "--rate", 200, "--noise", 0.05, "--seed", 3, "--free", "A,B,D0", "--out-dir", tmp_path / "run")
-    fitted = json.loads(srf("fit", tmp_path / "run", "--json").stdout)
+    fitted = json.loads(srf("fit", tmp_path / "run", "--track", "smooth", "--json").stdout)
     assert fitted["status"] == "ok"
     for row in fitted["rows"]:
         true = {"A": 0.0126, "B": 0.0241, "D0": 0.402}[row["parameter"]]

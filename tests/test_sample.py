@@ -63,7 +63,7 @@ def test_a_curved_ridge_is_sampled() -> None:
     mode[1], near[1], whole[1] = -0.5, 0.3**2, 0.5 + 0.3**2
     wide, names = np.full(k, 1e3), tuple("abcdef")
     sd, worth = np.sqrt(np.diag(turn * whole @ turn.T)), []
-    for seed in range(5):
+    for seed in range(3):
         found = draw(log_posterior, names, turn @ mode, turn * near @ turn.T, (-wide, wide), 4000, seed=seed)
         worth.append(found.effective.min() / len(found.draws))
         assert found.draws.std(axis=0) == pytest.approx(sd, rel=0.25)

@@ -147,7 +147,7 @@ def tables_for(size: float = 1.0) -> tuple[Spline, ...]:
 @needs_compiler
 def test_compiled_tables_are_those_of_lsoda(make_model):
     tables = tables_for()
-    common = {"by": (2, 6), "end": 0.3}
+    common = {"by": (2, 6), "end": 0.15}
     ours, other = motion(make_model, tables, **common), motion(make_model, tables, how="lsoda", **common)
     assert ours.status.ok and other.status.ok
     assert np.abs(ours.x - other.x).max() < 1e-5
