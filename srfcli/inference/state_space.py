@@ -380,7 +380,7 @@ def _field_columns(model: GeneratedModel, run: Run, p: Array, x0: Array) -> Arra
             moved.append(float(np.asarray(model.friction(x, V, W, 0.0, p)).imag) / TINY)
         out[states.index("ln_v"), j] = -out[place, j] * moved[0] / moved[1]  # friction there is what the start says
         if "z" in states:
-            out[states.index("z"), j] = np.exp(x0[states.index("ln_v")]) * out[states.index("ln_v"), j]
+            out[states.index("z"), j] = x0[states.index("z")] * out[states.index("ln_v"), j]
     return out
 
 
