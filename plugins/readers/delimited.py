@@ -111,7 +111,7 @@ def _layout(head: bytes) -> _Layout | None:
             cells = cells[:-1]
         if len(cells) != count:
             break
-        if names is None and units is None and 2 * sum(_is_unit(cell) for cell in cells) > count:  # degC, V, say, are none
+        if names is None and units is None and _are_units(cells):  # degC, V, say, are none
             units = cells
         elif names is None:
             names = cells
@@ -185,13 +185,17 @@ def _is_row(cells: Sequence[str], count: int, decimal: str) -> bool:
     return len(cells) == count and bool(filled) and all(_is_number(cell, decimal) for cell in filled)
 
 
-def _is_unit(cell: str) -> bool:
-    """Return whether a cell states a unit and nothing else: in brackets, or as the table of units has it."""
-    bare = cell.strip("[]() ")
-    if not bare or bare == "-":
-        return True
+def _are_units(cells: Sequence[str]) -> bool:
+    """Return whether most cells of a line state a unit and nothing else, in brackets or not, one of them a common unit."""
+    bare = [cell.strip("[]() ") for cell in cells]
+    told = [text for text in bare if text not in ("", "-")]
+    none = len(bare) - len(told)
+    return any(_is_unit(text, common=True) for text in told) and 2 * (none + sum(map(_is_unit, told))) > len(bare)
+
+
+def _is_unit(text: str, *, common: bool = False) -> bool:
     try:
-        find_unit(bare)
+        find_unit(text, common=common)
     except SrfError:
         return False
     return True

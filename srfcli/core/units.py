@@ -193,8 +193,11 @@ def tidy(value: float) -> float:
     return round_number if math.isclose(value, round_number, rel_tol=1e-14) else value
 
 
-def find_unit(text: str, *, where: str = "") -> Unit:
-    """Return the unit that `text` names; raises SrfError, beginning with `where`, if there is none."""
+def find_unit(text: str, *, where: str = "", common: bool = False) -> Unit:
+    """Return the unit that `text` names, a product of `common` ones only where these are to do; raises SrfError for none.
+
+    The error begins with `where`.
+    """
     if len(text) > LONGEST_QUANTITY:
         raise SrfError(f"{where}: {len(text)} characters are no unit".lstrip(": "), "Write a unit as in N/um, um/s.")
     spelled = text.strip().replace("**", "^").replace("μ", "u").replace("µ", "u")
@@ -209,6 +212,8 @@ def find_unit(text: str, *, where: str = "") -> Unit:
         over = -1 if sign == "/" else 1
         known = word if word in _TABLE else _SPELLED.get(word.lower(), word)
         if known not in _TABLE:
+            if common:
+                raise SrfError(f"{prefix}unknown unit {text!r}", did_you_mean(word, _TABLE), kind="unit")
             return _from_pint(spelled, prefix, word)
         exponent = over * int(power or 1)
         factor *= _TABLE[known].factor ** exponent
