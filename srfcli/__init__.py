@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from srfcli.tasks.map import map as map
     from srfcli.tasks.recordings import check as check
     from srfcli.tasks.recordings import fit as fit
+    from srfcli.tasks.recordings import fit_campaign as fit_campaign
     from srfcli.tasks.recordings import fit_thresholds as fit_thresholds
     from srfcli.tasks.recordings import new_experiment as new_experiment
     from srfcli.tasks.recordings import read_experiment as read_experiment
@@ -62,6 +63,7 @@ PUBLIC = {
     "diagnose": "srfcli.tasks.diagnose",
     "check": "srfcli.tasks.recordings",
     "fit": "srfcli.tasks.recordings",
+    "fit_campaign": "srfcli.tasks.recordings",
     "fit_thresholds": "srfcli.tasks.recordings",
     "new_experiment": "srfcli.tasks.recordings",
     "prove": "srfcli.validation.trials",
