@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.special import lambertw
 
 import srfcli as srf
@@ -179,3 +182,27 @@ def test_without_mass_and_compliance_the_classical_laws_are_degenerate(make_mode
         model = make_model(law="dieterich-ruina", ageing=ageing, interface="rigid", inertia=inertia)
         points = [hopf_points(model, model.vector({"V": V}))[0] for V in (1.0, 3.0, 10.0, 30.0)]
         assert {q.criticality for q in points} == {said}
+
+
+def test_rounding_is_no_root_under_a_stiffness_that_is_a_power_of_the_load():
+    """At small loads the mass swings on its spring, and the damping by friction is below rounding.
+
+    For srf-vsat the Hopf points have one frequency, and loads with D0/(c W0) = 1/kappa + 1/(K - M Omega^2), c = -d mu_ss/d ln V.
+    """
+    loads, exponents = np.geomspace(1e-9, 1e7, 200), [0.5, 1.2, 1.5, 2.0]
+    found = srf.linear(srf.system(interface="power"), over={"V": [10.0, 300.0], "n": exponents}, all_roots=True).to_dataframe()
+    A, B, D0, Vsat, K, M, kappa0, Wref, V = 0.0126, 0.0241, 0.402, 256.0, 0.21, 2.37e-6, 17.8571428571429, 10.0, 10.0
+    c = B * Vsat / (V + Vsat) - A
+    Omega = V / D0 * np.sqrt(c / A)
+    for n in exponents:
+
+        def excess(W0, n=n):
+            return D0 / (c * W0) - 1 / (kappa0 * (W0 / Wref) ** n) - 1 / (K - M * Omega**2)
+
+        wanted = [brentq(excess, a, b, xtol=1e-24) for a, b in pairwise(loads) if excess(a) * excess(b) < 0]
+        rows = found[(found["V"] == V) & (found["n"] == n)]
+        assert len(wanted) == (2 if n > 1 else 1)  # down to 7e-9 N: small loads that are roots stay
+        np.testing.assert_allclose(rows["W0"].astype(float), wanted, rtol=1e-9)
+        np.testing.assert_allclose(rows["Omega_c"].astype(float), Omega, rtol=1e-9)
+        assert list(rows["crossing_rate"] > 0) == [False, True][-len(wanted) :]
+    assert set(found[found["V"] == 300.0]["status"]) == {"velocity strengthening: no Hopf"}

@@ -1,7 +1,9 @@
 """Linear stability of steady sliding under constant load: critical loads, frequencies, and which way the Hopf bifurcation opens.
 
 All roots in W0 of the Hurwitz determinant are found (as polynomial roots where it is a polynomial in W0, else on a scan), those
-that belong to a pair of imaginary roots are polished on the exact characteristic polynomial, and crossing is checked.
+that belong to a pair of imaginary roots are polished on the exact characteristic polynomial, and crossing is checked. Under
+a small load a mass on its spring swings all but undamped, and the determinant is below its rounding: what vanishes there is no
+root.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel
 from srfcli.core.errors import Status
 
 WORST_RESIDUAL = 1e-9
+WORST_ROUNDING = 0.1  # part of its load by which rounding may move a root: so near, the slope there stands for the polynomial
 DEGENERATE = 1e-12  # of a Lyapunov coefficient, below which it is rounding: as of the classical laws without mass and compliance
 SCANNED_LOADS = np.geomspace(1e-9, 1e9, 1801)  # times K * 1 um: loads at which a non-polynomial determinant is looked at
 
@@ -153,7 +156,7 @@ def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
         return None
     for _ in range(30):
         value, by_s, by_load = _polynomial(model, p, W0, 1j * Omega)
-        matrix = np.array([[(1j * by_s).real, by_load.real], [(1j * by_s).imag, by_load.imag]])
+        matrix = _by_frequency_and_load(by_s, by_load)
         if abs(np.linalg.det(matrix)) == 0:
             return None
         step = np.linalg.solve(matrix, [-value.real, -value.imag])
@@ -168,6 +171,8 @@ def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
     if residual > WORST_RESIDUAL:
         return None  # not a root: rounding in the determinant
     _, by_s, by_load = _polynomial(model, p, W0, 1j * Omega)
+    if not _rounding(model, p, W0, Omega, _by_frequency_and_load(by_s, by_load)) < WORST_ROUNDING:
+        return None  # rounding in the polynomial itself
     roots = np.roots(np.asarray(model.characteristic(_with_load(model, p, W0)))[::-1])
     others = roots[np.abs(np.abs(roots.imag) - Omega) + np.abs(roots.real) > 1e-5 * Omega]
     return HopfPoint(
@@ -187,6 +192,29 @@ def _polynomial(model: GeneratedModel, p: Array, W0: float, s: complex) -> tuple
     powers = s ** np.arange(a.shape[-1])
     k = np.arange(1, a.shape[-1])
     return complex(a.real @ powers), complex((k * a.real[1:]) @ powers[:-1]), complex((a.imag / h) @ powers)
+
+
+def _by_frequency_and_load(by_s: complex, by_load: complex) -> Array:
+    """Return the derivatives (2, 2) of the real and the imaginary part of P(i Omega; W0) by Omega and W0."""
+    return np.array([[(1j * by_s).real, by_load.real], [(1j * by_s).imag, by_load.imag]])
+
+
+def _rounding(model: GeneratedModel, p: Array, W0: float, Omega: float, matrix: Array) -> float:
+    """Return by what part of itself rounding may move the load `W0` of a root i Omega, to first order; `matrix` is P's there.
+
+    A coefficient a_k is a sum of products of parameters. Where every factor of every product is rounded, it changes by up to
+    eps sum_j |p_j da_k/dp_j| (complex steps); where the terms of P are powers and are added up, by up to n eps |a_k|.
+    """
+    if abs(np.linalg.det(matrix)) == 0:
+        return math.inf
+    q = np.asarray(_with_load(model, p, W0), dtype=float)
+    with np.errstate(all="ignore"):  # a power of 0 has no slope by its exponent, and needs none
+        moved = np.asarray(model.characteristic(q[:, None] + 1j * np.diag(COMPLEX_STEP * np.abs(q))))  # (n_parameters, n+1)
+    n = moved.shape[-1] - 1
+    errors = np.nansum(np.abs(moved.imag), axis=0) / COMPLEX_STEP + n * np.abs(model.characteristic(q))
+    errors = np.finfo(float).eps * errors * Omega ** np.arange(n + 1)
+    real, imaginary = errors[0::2].sum(), errors[1::2].sum()
+    return float(np.abs(np.linalg.inv(matrix)[1]) @ [real, imaginary] / W0)
 
 
 def rest_state(model: GeneratedModel, p: Array) -> tuple[Array, Array]:
