@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from datetime import date
+from itertools import zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
@@ -312,13 +313,11 @@ class _Table:
         """Return the headings, with the unit s where the first row has a time stamp."""
         with self.path.open("rb") as stream:
             stream.seek(self.offset)
-            lines = (raw.partition(b"\r")[0].decode("latin-1").strip() for raw in iter(lambda: stream.readline(LONGEST), b""))
-            first = next((text for text in lines if text and not text.startswith(("#", "%"))), "")
-        cells = [cell.strip() for cell in (first.split() if self.delimiter == " " else first.split(self.delimiter))]
-        if len(cells) < len(self.headings):
-            return self.headings
-        stamps = [STAMP.fullmatch(cell.strip('"').replace(self.decimal, ".")) for cell in cells]
-        return tuple(f"{split_heading(h)[0]} [s]" if stamp else h for h, stamp in zip(self.headings, stamps, strict=False))
+            cells = _cells(_decoded(_first_line(stream.read(SAMPLE))), self.delimiter)
+        stamps = [STAMP.fullmatch(cell.replace(self.decimal, ".")) for cell in cells]
+        return tuple(
+            f"{split_heading(h)[0]} [s]" if stamp else h for h, stamp in zip_longest(self.headings, stamps) if h is not None
+        )
 
     def blocks(self, columns: tuple[int, ...]) -> Iterator[Sequence[np.ndarray]]:
         """Yield the columns in blocks of rows."""

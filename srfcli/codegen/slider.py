@@ -168,7 +168,7 @@ class Opener:
     def __post_init__(self) -> None:
         check_effects(self.registry, self.effects)
 
-    @property
+    @cached_property
     def formulas(self) -> System:
         """Return the laws joined to a system of formulas; raises SrfError for a system with effects, which have none here."""
         from srfcli.symbolic.system import build_system

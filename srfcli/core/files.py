@@ -355,7 +355,7 @@ def check_target(path: Path, *, force: bool, what: str = "--out") -> None:
     recover(path)
     shown = f"{what} {path}".strip()
     if path.is_dir():
-        raise SrfError(f"{shown} is a directory", f"Name a file in it: {what} {path / 'result.csv'}")
+        raise SrfError(f"{shown} is a directory", "Name a file in it: " + f"{what} {path / 'result.csv'}".strip())
     if not path.parent.is_dir():
         raise SrfError(f"{shown}: the directory {path.parent} does not exist", f"Create it: mkdir -p {path.parent}")
     if is_special(path):

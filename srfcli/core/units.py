@@ -213,7 +213,7 @@ def find_unit(text: str, *, where: str = "", common: bool = False) -> Unit:
         known = word if word in _TABLE else _SPELLED.get(word.lower(), word)
         if known not in _TABLE:
             if common:
-                raise SrfError(f"{prefix}unknown unit {text!r}", did_you_mean(word, _TABLE), kind="unit")
+                raise SrfError(f"{prefix}{text!r} is no common unit", did_you_mean(word, _TABLE), kind="unit")
             return _from_pint(spelled, prefix, word)
         exponent = over * int(power or 1)
         factor *= _TABLE[known].factor ** exponent

@@ -33,8 +33,9 @@ LACKING = 40.0  # in log evidence, what a model that fails a test loses in the s
 # the likeliest shares of the last 109 sealed cases (benchmarks/calibration.py): of something else being concealed where a model
 # passed, of what is concealed being registered, or nothing, where the verdict is unknown
 UNEXPLAINED, MISSED = 0.09, 0.65
-VERDICTS = ("none", "inconclusive", "identified", "ambiguous", "unknown")
-MISSING, DOUBTFUL, UNKNOWN = VERDICTS[2:], (*VERDICTS[4:], "in one run"), VERDICTS[4:]
+UNKNOWN, ALONE = "unknown", "in one run"  # when a remark is told: under these verdicts, or where an effect acts in one run
+MISSING = ("identified", "ambiguous", UNKNOWN)
+ALWAYS = ("none", "inconclusive", *MISSING)
 
 
 @dataclass(frozen=True)
@@ -169,20 +170,22 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     shown = on_the_track_of(best, baseline) if best.passes else baseline
     held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
     wrong = [] if best.passes else [*uneven_noise(best.fit), *unsteady_start(search, best)]
-    remarks = [*((text, UNKNOWN) for text in wrong), *not_the_same(baseline)]
+    remarks = [*((text, (UNKNOWN,)) for text in wrong), *not_the_same(baseline)]
     remarks += [(text, MISSING) for text in told_of_runs(search.whole.runs, BETWEEN_SAMPLES)]
     if search.on_request:
         names = ", ".join(search.on_request)
-        remarks.append((f"not tried, as they are looked for where they are named alone: {names}; --effect NAME", DOUBTFUL))
+        remarks.append(
+            (f"not tried, as they are looked for where they are named alone: {names}; --effect NAME", (UNKNOWN, ALONE))
+        )
     if whole.runs and not baseline.fit.likelihood.problem.runs:
-        remarks.append(("held-out runs are not judged, as no run was fitted that would tell the gauge's noise", VERDICTS))
+        remarks.append(("held-out runs are not judged, as no run was fitted that would tell the gauge's noise", ALWAYS))
     if own_noise:
         said = f"each {whole.vary[GAUGE_NOISE]} was given a gauge noise of its own, as no one noise is that of all"
-        remarks.append((said, VERDICTS))
+        remarks.append((said, ALWAYS))
     for fitted in close or (best,):
         for name in at_bounds(fitted):
             there = "" if name in (q.name for q in whole.parameters) else " of the augmented experiment"
-            remarks.append((f"{name} of {fitted.name} stands at its bound; [parameters]{there} can widen it", VERDICTS))
+            remarks.append((f"{name} of {fitted.name} stands at its bound; [parameters]{there} can widen it", ALWAYS))
     judged = judge(
         models, baseline.singles, [h.predicted for h in held if best.passes], [h.predicted for h in held_loads],
         search.excluded, remarks, search.budget if search.cut_short else None,
@@ -199,8 +202,8 @@ def judge(
 ) -> Conclusion:  # fmt: skip
     """Return what follows from models, best evidence first, scores of the baseline, and how what is held out is predicted.
 
-    `remarks` are sentences, each with the verdicts under which it is told, or where what is identified acts "in one run". `ended`
-    is the budget, in s of CPU, of a search that left models to fit.
+    `remarks` are sentences, each with the verdicts under which it is told, or ALONE, where what is identified acts in one run.
+    `ended` is the budget, in s of CPU, of a search that left models to fit.
     """
     close, joint, became = may_be_it(ranked)
     best = close[0] if close else ranked[0]
@@ -209,7 +212,7 @@ def judge(
     verdict = "unknown" if refused else ungated
     alone = verdict == "identified" and any(e.run for e in best.hypothesis.effects)
     reasons += [refused] if refused else []
-    reasons += [text for text, under in remarks if verdict in under or (alone and "in one run" in under)]
+    reasons += [text for text, under in remarks if verdict in under or (alone and ALONE in under)]
     if ended is not None:
         reasons.append(f"the search ended at its budget of {ended:.0f} s of CPU, with models left to fit")
     named = tuple(dict.fromkeys(n for m in close for n in m.hypothesis.reported))
@@ -257,7 +260,7 @@ def not_the_same(baseline: Fitted) -> list[tuple[str, Sequence[str]]]:
     there, here = (f"{from_base(x, unit):.3g}{'' if unit == '1' else ' ' + unit}" for x in (value + own.change, value))
     said = f"{own.parameter} of {own.run} alone, about {there} where the baseline has {here}"
     said = f"{said}, would gain {own.gain:.0f} in log likelihood: --vary {own.parameter}"
-    return [(said, UNKNOWN if own.gain < max(gains, default=0.0) else DOUBTFUL)]
+    return [(said, (UNKNOWN,) if own.gain < max(gains, default=0.0) else (UNKNOWN, ALONE))]
 
 
 def asked(ranked: Sequence[M]) -> list[M]:

@@ -1337,7 +1337,7 @@ def likeliest_end(rough: Likelihood, ends: Iterable[Maximum]) -> Maximum | None:
     found: Maximum | None = None
     bounded = False
     at = rough.names.index("field_amplitude")
-    faint = rough.lower[at] + np.log(FAINT_FIELD / LEAST_FIELD)
+    faint = _amplitude(rough, FAINT_FIELD)
     for other in ends:
         if found is None or other.point.log_likelihood > found.point.log_likelihood:
             found = other
@@ -1692,7 +1692,7 @@ def _with_or_without(
         return StateSpaceFit(rough, own)
     plain = likelihood(True, rough.processes)
     at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
-    faint = rough.lower[at] + np.log(FAINT_FIELD / LEAST_FIELD)
+    faint = _amplitude(rough, FAINT_FIELD)
 
     def without_field(steps: int) -> StateSpaceFit:
         progress("without a field")
@@ -1837,8 +1837,13 @@ def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Arra
     """Return x under a field of amplitude `wide` over the friction of the recordings, its length `short` times the start's."""
     amplitude, length = (rough.names.index(n) for n in FIELD)
     found = x.copy()
-    found[amplitude], found[length] = rough.lower[amplitude] + np.log(wide / LEAST_FIELD), rough.start[length] + np.log(short)
+    found[amplitude], found[length] = _amplitude(rough, wide), rough.start[length] + np.log(short)
     return found
+
+
+def _amplitude(rough: Likelihood, share: float) -> float:
+    """Return the coordinate of a field's amplitude that is this share of the friction of the recordings."""
+    return float(rough.lower[rough.names.index("field_amplitude")] + np.log(share / LEAST_FIELD))
 
 
 def wide_starts(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Iterator[Array]:

@@ -194,6 +194,7 @@ def row(check: RunCheck, told: CramerRaoBound | None) -> tuple[Any, ...]:
     """Return the cells of one run under COLUMNS."""
     run, load, rates = check.run, check.load, [1 / r.interval for r in check.sampling.rates]
     read, found = run.observed[run.used], load.modulation
+    mean, lowest, highest = (load.mean, load.lowest, load.highest) if run.load_known else (None, None, None)
     found_out = {} if told is None else {"error": told.errors, "peak": told.peaks}
     cells = {
         "run": run.name, "role": "held out" if run.holdout else "fit", "samples": run.t.size, "used": int(run.used.sum()),
@@ -203,12 +204,12 @@ def row(check: RunCheck, told: CramerRaoBound | None) -> tuple[Any, ...]:
         "noise": check.noise.total, "white_noise": check.noise.white,
         "colour": "; ".join(map(colour_text, check.noise.colours)), "quantum": run.quantum,
         "V_min": check.slowest, "V_max": check.fastest,
-        **({"W_mean": load.mean, "W_min": load.lowest, "W_max": load.highest} if run.load_known else {}), "W_rate": load.rate,
+        "W_mean": mean, "W_min": lowest, "W_max": highest, "W_rate": load.rate,
         "f": found.frequency if found else None, "eps": found.amplitude if found else None,
         "onset": found.onset if found and math.isfinite(found.onset) else None,
         **{f"{name}_{key}": found_out.get(key, {}).get(name) for name in CHANGE_HEADINGS for key in ("error", "peak")},
     }  # fmt: skip
-    return tuple(cells.get(column.name) for column in COLUMNS)
+    return tuple(cells[column.name] for column in COLUMNS)
 
 
 def _noise_table(checks: Sequence[RunCheck]) -> Table:

@@ -108,8 +108,8 @@ def _panel(axes: list[Axes], check: RunCheck) -> None:
     run, t = check.run, check.run.t
     V, W = run.drive(t), run.load(t)[0]
     quantity = run.quantity + (f"\n[{unit_text(run.unit)}]" if run.unit != "1" else "")
-    panels = ((run.observed, "u", quantity), (V, "v", "V\n[µm/s]"), (W, "W", f"W\n[{run.load_unit}]"))
-    for axis, (values, key, label) in zip(axes, panels, strict=False):
+    panels = [(run.observed, "u", quantity), (V, "v", "V\n[µm/s]"), (W, "W", f"W\n[{run.load_unit}]")]
+    for axis, (values, key, label) in zip(axes, panels if run.load_known else panels[:2], strict=True):
         axis.plot(*envelope(t, values), color=plots.QUANTITY[key], linewidth=0.8)
         axis.set_ylabel(label)
         axis.margins(x=0.01, y=0.08)

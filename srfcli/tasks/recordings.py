@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srfcli.core.errors import SrfError, Status, as_names, as_pairs, check_choice, did_you_mean
+from srfcli.core.errors import SrfError, Status, as_names, as_pairs, check_choice
 from srfcli.core.parallel import Runner, run_here
 from srfcli.core.settings import resolve
 from srfcli.core.units import from_base, parse_quantity, split_quantity, to_base
@@ -613,23 +613,13 @@ def fit_campaign(
     >>> mu = 0.6 + np.random.default_rng(1).normal(0, 2e-4, 200)
     >>> lines = ["time [s],load_point_velocity [um/s],friction", *(f"{0.1 * i:.1f},3,{x}" for i, x in enumerate(mu))]
     >>> _ = Path("one/run.csv").write_text("\\n".join(lines))
-    >>> described = '''
-    ... format = "srf-experiment/1"
-    ... apparatus = { stiffness = "3e-2 1/um" }
-    ... model = { law = "dieterich-ruina", ageing = "ruina", interface = "rigid", inertia = false }
-    ... parameters = { mu0 = { value = 0.5, lower = 0.1, upper = 1.0 } }
-    ... runs = [{ name = "run", file = "run.csv", load = "10 MPa" }]
-    ... '''
-    >>> _ = Path("one/experiment.toml").write_text(described)
-    >>> found = srf.fit_campaign(["one", "two"], options={"track": "smooth"})
+    >>> srf.new_experiment("one/run.csv", stiffness="3e-2 1/um", load="10 MPa", folder="one").write()
+    >>> found = srf.fit_campaign(["one", "two"], options={"track": "smooth", "free": ["mu0"]})
     >>> [(row["experiment"], row["status"]) for row in found.table.records()]
     [('one', 'ok'), ('two', 'failed')]
     """
-    unknown = [name for name in options or {} if name not in inspect.signature(fit).parameters]
-    if unknown:
-        raise SrfError(
-            f"`options`: fit has no argument '{unknown[0]}'", did_you_mean(unknown[0], inspect.signature(fit).parameters)
-        )
+    for name in options or {}:
+        check_choice("options", name, tuple(inspect.signature(fit).parameters))
     tasks = [
         Task(str(p), tuple(sorted((options or {}).items())), reader, tuple(map(str, plugins)), _digest(Path(p))) for p in paths
     ]

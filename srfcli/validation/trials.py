@@ -264,7 +264,8 @@ class ProofResult(Result):
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the rates of right and of wrong answers with their intervals of 95 %."""
         rates = marking.rates(self.marks).records()
-        with plots.one_panel(ax, title=self.table.notes[0], size=(7.0, 1.0 + 0.3 * len(rates))) as (figure, axes):
+        title = f"{len(self.marks)} cases of seed {self.asked['seed']}"
+        with plots.one_panel(ax, title=title, size=(7.0, 1.0 + 0.3 * len(rates))) as (figure, axes):
             share, low, high = ([rate[name] for rate in rates] for name in ("share", "low", "high"))
             widths = [[s - a for s, a in zip(share, low, strict=True)], [b - s for s, b in zip(share, high, strict=True)]]
             axes.errorbar(share, range(len(rates)), xerr=widths, fmt="o", capsize=3, color=plots.COLOURS[0])
