@@ -27,7 +27,7 @@ from marked import marked
 from srfcli.diagnosis.verdict import MISSED, UNEXPLAINED
 from srfcli.validation.blind import read_answers
 from srfcli.validation.cases import unseal
-from srfcli.validation.marks import Mark, calibrated, calibration_of, hypothesis
+from srfcli.validation.marks import Mark, calibrated, calibration_of, holds
 
 TEMPERED = 3.0  # by which log evidence was divided up to the sixteenth trial
 TEMPERS = np.geomspace(0.5, 60.0, 97)
@@ -58,7 +58,7 @@ def restated(m: Mark, numbers: Three) -> Mark:
 
 def hit(m: Mark, name: str) -> bool:
     """Return whether a hypothesis is the truth, or as good."""
-    return hypothesis(name) in m.accepted
+    return holds(name, m.accepted)
 
 
 def score(m: Mark) -> float:
@@ -84,8 +84,9 @@ def fitted(marks: Sequence[Mark], share: Array | None = None) -> Three:
     share = shares(marks) if share is None else share
     spoken, unknown = np.array([passed(m) for m in marks]), np.array([hit(m, "unknown") for m in marks])
     known = np.array([any(hit(m, n) for n in m.answer.confidence if n not in ("unknown", "missed")) for m in marks])
+    registered = np.array([hit(m, "missed") for m in marks])
     unexplained = (np.sum(spoken & ~known) + LEAST) / (np.sum(spoken) + 2 * LEAST)
-    missed = (np.sum(~spoken & ~unknown) + LEAST) / (np.sum(~spoken) + 2 * LEAST)
+    missed = (np.sum(~spoken & registered) + LEAST) / (np.sum(~spoken) + 2 * LEAST)
     given = (1 - unexplained) * share[spoken] + unexplained * unknown[spoken, None]
     best = int(np.argmax(np.sum(np.log(np.maximum(given, FLOOR)), axis=0)))
     return float(TEMPERS[best]), float(unexplained), float(missed)

@@ -429,6 +429,8 @@ class ModelSearch:
             for node in nodes:
                 self._expand(node)
             self._search()
+            self._try_rivals(self.best())
+            self._search()
             self._eliminate(self.best())
 
     @property

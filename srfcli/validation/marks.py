@@ -128,7 +128,7 @@ def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
         right or _listed(truth, answer),
         top,
         shares.get(top, 0.0),
-        hypothesis(top) in allowed,
+        holds(top, allowed),
         _ratio(answer, sight, "augmented"),
         _ratio(answer, sight, "baseline"),
         deviation(truth, answer),
@@ -183,6 +183,11 @@ def accepted(truth: Mapping[str, Any], invisible: tuple[str, ...]) -> Accepted:
 def hypothesis(name: str) -> tuple[str, frozenset[str]]:
     """Return the verdict and effects that a hypothesis stands for: none, unknown, or names joined by +."""
     return (name, frozenset()) if name in ("none", "unknown", "") else ("identified", frozenset(name.split("+")))
+
+
+def holds(name: str, allowed: Accepted) -> bool:
+    """Return whether what a confidence is in is right: a hypothesis, or that a registered one, or none, was `missed`."""
+    return hypothesis(name) in allowed or (name == "missed" and bool(allowed - {hypothesis("unknown")}))
 
 
 def _listed(truth: Mapping[str, Any], answer: Answer) -> bool:
