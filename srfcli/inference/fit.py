@@ -271,10 +271,3 @@ def between_groups(values: Array, covariance: Array) -> BetweenGroups:
     scatter = float(found.x) if found.fun < about(0.0)[3] else 0.0
     mean, variance = about(scatter)[:2]
     return BetweenGroups(mean, float(np.sqrt(variance)), scatter, chance_of(about(0.0)[2], k - 1))
-
-
-def scatter_of(fit: Fit, names: Sequence[str]) -> BetweenGroups | None:
-    """Return how the values of one parameter in several groups scatter; None where one is at its bound, its error not known."""
-    places = [fit.names.index(n) for n in names]
-    covariance = np.asarray(fit.covariance)[np.ix_(places, places)]
-    return between_groups(np.array([fit.values[n] for n in names]), covariance) if (np.diag(covariance) > 0).all() else None

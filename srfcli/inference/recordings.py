@@ -13,7 +13,7 @@ from srfcli.codegen.model import Array, open_model
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment, Run
-from srfcli.inference.fit import BetweenGroups, Fit, Problem, fit_problem, scatter_of
+from srfcli.inference.fit import BetweenGroups, Fit, Problem, between_groups, fit_problem
 from srfcli.inference.shared_field import fit_shared
 from srfcli.inference.state_space import NEEDED, Interrupted, StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
 from srfcli.laws.registry import Registry
@@ -57,24 +57,29 @@ MANY_GROUPS = 5  # groups from which their scatter is known well enough to be a 
 NO_SCATTER = 0.01  # of the errors: a scatter that stands for none at all
 
 
-def _with_scatter(found: RecordingFit, *, prior: bool) -> RecordingFit:
-    """Return the fit with how the values of groups scatter, and, with `prior`, with values drawn towards their means.
+def _scatter(found: StateSpaceFit) -> dict[str, BetweenGroups | None]:
+    """Return how the values of each parameter that varies scatter; None where one is at its bound, its error not known."""
+    told: dict[str, BetweenGroups | None] = {}
+    for n, names in found.likelihood.problem.groups.items():
+        places = [found.likelihood.names.index(name) for name in names]
+        covariance = found.covariance[np.ix_(places, places)]
+        known = bool((np.diag(covariance) > 0).all())
+        told[n] = between_groups(np.array([found.values[name] for name in names]), covariance) if known else None
+    return told
+
+
+def _drawn_together(found: StateSpaceFit, scatter: Mapping[str, BetweenGroups | None]) -> StateSpaceFit:
+    """Return the fit with the values of many groups drawn towards their means.
 
     The prior is Gaussian, of unknown mean; its standard deviation is how values scatter beyond their errors: empirical Bayes.
     """
-    groups, fit = found.problem.groups, found.fit
-    scatter = {n: scatter_of(fit, names) for n, names in groups.items()}
-    priors = []
+    priors, errors = [], np.sqrt(np.diag(found.covariance))
     for n, own in scatter.items():
-        if own is not None and len(groups[n]) >= MANY_GROUPS:
-            error = float(np.mean([fit.stderr[name] for name in groups[n]]))
-            priors.append((groups[n], max(own.scatter, NO_SCATTER * error)))
-    found = replace(found, scatter=scatter)
-    if not (prior and priors and found.state_space):
-        return found
-    shrunk = with_priors(found.state_space, priors)
-    fit = as_fit(shrunk)
-    return replace(found, problem=shrunk.likelihood.problem, fit=fit, state_space=shrunk, status=fit.status)
+        names = found.likelihood.problem.groups[n]
+        if own is not None and len(names) >= MANY_GROUPS:
+            error = float(np.mean(errors[[found.likelihood.names.index(name) for name in names]]))
+            priors.append((names, max(own.scatter, NO_SCATTER * error)))
+    return with_priors(found, priors) if priors else found
 
 
 def fit_recordings(
@@ -131,10 +136,11 @@ def fit_recordings(
     except Interrupted as error:
         found = stopped(problem, error.found)
         return RecordingFit(problem, as_fit(found), found, _track(found), (), Status.INTERRUPTED)
-    found, best = several.best, as_fit(several.best)
+    scatter = _scatter(several.best)
+    found = _drawn_together(several.best, scatter) if prior and not several.interrupted else several.best
+    best = as_fit(found)
     status = Status.INTERRUPTED if several.interrupted else best.status
-    result = RecordingFit(problem, best, found, _track(found), tuple(several.rows), status)
-    result = _with_scatter(result, prior=prior and not several.interrupted)
+    result = RecordingFit(found.likelihood.problem, best, found, _track(found), tuple(several.rows), status, scatter)
     if several.interrupted or len(problem.runs) < 2 or problem.tables:
         return result
     try:
