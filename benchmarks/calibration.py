@@ -1,12 +1,13 @@
 """What the stated confidence of a sealed trial should have been: its temper, its share of the unknown, and what they are worth.
 
-    python benchmarks/calibration.py TRIAL [TRIAL ...] [--tempered TRIAL] [--check TRIAL]
+    python benchmarks/calibration.py TRIAL [TRIAL ...] [--tempered TRIAL] [--check TRIAL] [--numbers TEMPER UNEXPLAINED MISSED]
 
 Each TRIAL is a folder of `srf prove`, unsealed. A confidence is exp(log evidence), normalised over the models that were fitted,
 times 1 - unexplained where one passes every test; where none does, 1 - missed is what `unknown` has. Up to the sixteenth trial
 log evidence was divided by a temper of 3 first, and would another number than 1 be better, this finds it. The three numbers are
 those under which the truths are likeliest (log score; Good, J. R. Stat. Soc. B 14, 1952), and their intervals come of cases
-drawn again. Whether they hold is seen in cases that did not take part: each fifth of the cases by the others, and --check.
+drawn again. Whether they hold is seen in cases that did not take part: each fifth of the cases by the others, --check, and
+--numbers, which trials gave whose folders are gone.
 """
 
 from __future__ import annotations
@@ -130,6 +131,7 @@ def main() -> None:
     parser.add_argument("trials", type=Path, nargs="*")
     parser.add_argument("--tempered", type=Path, action="append", default=[], help="a trial up to the sixteenth")
     parser.add_argument("--check", type=Path, action="append", default=[])
+    parser.add_argument("--numbers", type=float, nargs=3, help="those of other trials, that state what these would have")
     given = parser.parse_args()
     if not (given.trials or given.tempered):
         parser.error("give a TRIAL, or one with --tempered")
@@ -149,6 +151,10 @@ def main() -> None:
     report.table(("number", "as it is", "likeliest", "95 %"), rows)
     tell(report, "as they were stated", [*before, *since])
     tell(report, "as they would be stated now", marks)
+    if given.numbers:
+        temper, unexplained, missed = given.numbers
+        told = f"by the numbers {temper:g}, {unexplained:g}, {missed:g} of other trials"
+        tell(report, told, [restated(m, (temper, unexplained, missed)) for m in marks])
     tell(report, "each fifth by the numbers of the others", by_others(marks))
     for folder in given.check:
         other = now(read([folder]))
