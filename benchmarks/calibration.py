@@ -1,10 +1,9 @@
 """What the stated confidence of a sealed trial should have been: its temper, its share of the unknown, and what they are worth.
 
-    python benchmarks/calibration.py TRIAL [TRIAL ...] [--tempered TRIAL] [--check TRIAL] [--numbers TEMPER UNEXPLAINED MISSED]
+    python benchmarks/calibration.py TRIAL [TRIAL ...] [--temper NUMBER] [--check TRIAL] [--numbers TEMPER UNEXPLAINED MISSED]
 
-Each TRIAL is a folder of `srf prove`, unsealed. A confidence is exp(log evidence), normalised over the models that were fitted,
-times 1 - unexplained where one passes every test; where none does, 1 - missed is what `unknown` has. Up to the sixteenth trial
-log evidence was divided by a temper of 3 first, and would another number than 1 be better, this finds it. The three numbers are
+Each TRIAL is a folder of `srf prove`, unsealed. A confidence is exp(log evidence / temper), normalised over the models that were
+fitted, times 1 - unexplained where one passes every test; where none does, 1 - missed is what `unknown` has. The three are
 those under which the truths are likeliest (log score; Good, J. R. Stat. Soc. B 14, 1952), and their intervals come of cases
 drawn again. Whether they hold is seen in cases that did not take part: each fifth of the cases by the others, --check, and
 --numbers, which trials gave whose folders are gone.
@@ -25,12 +24,11 @@ import numpy.typing as npt
 from common import Report
 from marked import marked
 
-from srfcli.diagnosis.verdict import MISSED, UNEXPLAINED
+from srfcli.diagnosis.verdict import MISSED, TEMPER, UNEXPLAINED
 from srfcli.validation.blind import read_answers
 from srfcli.validation.cases import unseal
 from srfcli.validation.marks import Mark, calibrated, calibration_of, holds
 
-TEMPERED = 3.0  # by which log evidence was divided up to the sixteenth trial
 TEMPERS = np.geomspace(0.5, 60.0, 97)
 LEAST = 0.5  # cases that are added to each side of a share, so that none is 0 or 1 (Jeffreys)
 FLOOR = 1e-3  # least probability that a truth is given: of a model that was never fitted
@@ -128,37 +126,35 @@ def read(folders: Sequence[Path]) -> list[Mark]:
 def main() -> None:
     """Fit the three numbers to the trials, say what they are worth, and check them on another trial."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("trials", type=Path, nargs="*")
-    parser.add_argument("--tempered", type=Path, action="append", default=[], help="a trial up to the sixteenth")
-    parser.add_argument("--check", type=Path, action="append", default=[])
+    parser.add_argument("trials", type=Path, nargs="+")
+    parser.add_argument("--temper", type=float, default=TEMPER, help="of their answers: 3 up to the 16th trial, 1 to the 28th")
+    parser.add_argument("--check", type=Path, action="append", default=[], help="trials that were answered with the same temper")
     parser.add_argument("--numbers", type=float, nargs=3, help="those of other trials, that state what these would have")
     given = parser.parse_args()
-    if not (given.trials or given.tempered):
-        parser.error("give a TRIAL, or one with --tempered")
 
-    def now(marks: Sequence[Mark], temper: float = 1.0) -> list[Mark]:
-        return [restated(m, (1 / temper, UNEXPLAINED, MISSED)) for m in marks]
+    def untempered(marks: Sequence[Mark]) -> list[Mark]:
+        return [restated(m, (1 / given.temper, UNEXPLAINED, MISSED)) for m in marks]
 
-    before, since = read(given.tempered), read(given.trials)
-    report, marks = Report("calibration", __doc__ or ""), [*now(before, TEMPERED), *now(since)]
+    now = (TEMPER, UNEXPLAINED, MISSED)
+    report, told = Report("calibration", __doc__ or ""), read(given.trials)
+    marks = untempered(told)
     best, rng = fitted(marks), np.random.default_rng(0)
     share, chosen = shares(marks), rng.integers(len(marks), size=(DRAWS, len(marks)))
     drawn = np.array([fitted([marks[i] for i in own], share[own]) for own in chosen])
     low, high = np.quantile(drawn, (0.025, 0.975), axis=0)
-    names, stated = ("temper", "unexplained", "missed"), (1.0, UNEXPLAINED, MISSED)
-    numbers = zip(names, stated, best, low, high, strict=True)
+    numbers = zip(("temper", "unexplained", "missed"), now, best, low, high, strict=True)
     rows = [(n, f"{s:g}", f"{b:.3g}", f"{a:.3g} to {c:.3g}") for n, s, b, a, c in numbers]
     report.table(("number", "as it is", "likeliest", "95 %"), rows)
-    tell(report, "as they were stated", [*before, *since])
-    tell(report, "as they would be stated now", marks)
+    tell(report, "as they were stated", told)
+    tell(report, "as they would be stated now", [restated(m, now) for m in marks])
     if given.numbers:
         temper, unexplained, missed = given.numbers
         told = f"by the numbers {temper:g}, {unexplained:g}, {missed:g} of other trials"
         tell(report, told, [restated(m, (temper, unexplained, missed)) for m in marks])
     tell(report, "each fifth by the numbers of the others", by_others(marks))
     for folder in given.check:
-        other = now(read([folder]))
-        tell(report, f"{folder.name}, as they would be stated now", other)
+        other = untempered(read([folder]))
+        tell(report, f"{folder.name}, as they would be stated now", [restated(m, now) for m in other])
         tell(report, f"{folder.name}, by these numbers", [restated(m, best) for m in other])
 
 

@@ -171,7 +171,7 @@ def test_confidence_alarms_and_wrong_names():
     assert marked(truth_of("age-exponent", verdict="unknown"), "unknown").hit
     assert not marked(truth_of("age-exponent", verdict="unknown"), "none").hit
     undecided = {"unknown": 0.35, "missed": 0.65}  # of which the second is that something registered, or nothing, was concealed
-    assert marked(truth_of(ALPHA), "unknown", confidence=undecided).hit and marked(truth_of(), "unknown", confidence=undecided).hit
+    assert all(marked(truth, "unknown", confidence=undecided).hit for truth in (truth_of(ALPHA), truth_of()))
     assert not marked(truth_of("age-exponent", verdict="unknown"), "unknown", confidence=undecided).hit
 
 

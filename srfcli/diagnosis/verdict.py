@@ -30,6 +30,8 @@ ABSORBED_SHARE = 2e-3  # share of an effect's squared signal below which paramet
 ALIKE = 0.97  # likeness of two effects' projected columns beyond which they are one class
 BEHIND = 50.0  # in log evidence, by how much a model may be behind and still be asked what it predicts
 LACKING = 40.0  # in log evidence, what a model that fails a test loses in the stated confidence
+# by what log evidence is divided in the stated confidence: likeliest in 224 sealed cases (1.3 to 2.5; benchmarks/calibration.py)
+TEMPER = 1.83
 # the likeliest shares of the last 109 sealed cases (benchmarks/calibration.py): of something else being concealed where a model
 # passed, of what is concealed being registered, or nothing, where the verdict is unknown
 UNEXPLAINED, MISSED = 0.09, 0.65
@@ -454,13 +456,13 @@ def _equivalent(
 
 
 def _confidence(ranked: Sequence[Model], joint: Mapping[str, float], became: Mapping[str, str], verdict: str) -> dict[str, float]:
-    """Return the stated confidence in each model, by evidence, in `unknown`, in what the search `missed` where none passes.
+    """Return the stated confidence in each model, by tempered evidence, in `unknown`, in what was `missed` where none passes.
 
     A model that became another law is that law.
     """
     weights = {m.name: joint[m.name] - (LACKING if m.against else 0.0) for m in ranked}
     top = max(weights.values())
-    share = {name: float(np.exp(max(w - top, -60.0))) for name, w in weights.items()}
+    share = {name: float(np.exp(max((w - top) / TEMPER, -60.0))) for name, w in weights.items()}
     total, unknown = sum(share.values()), 1 - MISSED if verdict == "unknown" else UNEXPLAINED
     for name, law in became.items():
         while law in became:  # each has fewer parameters than the one before
