@@ -12,7 +12,7 @@ import pytest
 from srfcli.core.settings import Parameter
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, neutral_values
 from srfcli.diagnosis.scores import Score
-from srfcli.diagnosis.verdict import HELD_OUT_RMS, MISSED, UNEXPLAINED, Conclusion, Model, Predicted, interesting, judge
+from srfcli.diagnosis.verdict import HELD_OUT_RMS, MISSED, TEMPER, UNEXPLAINED, Conclusion, Model, Predicted, interesting, judge
 from srfcli.laws.registry import bundled_registry
 
 SHIPPED = bundled_registry()
@@ -71,7 +71,7 @@ def test_a_further_effect_that_gains_little_is_not_named():
 def test_models_that_do_equally_well_are_all_named():
     found = concluded(model("slip-evolution", evidence=101.0), model("viscous-drag", evidence=99.0), LOST)
     assert (found.verdict, set(found.effects)) == ("ambiguous", {"viscous-drag", "slip-evolution"})
-    assert found.confidence["slip-evolution"] / found.confidence["viscous-drag"] == pytest.approx(np.exp(2.0))
+    assert found.confidence["slip-evolution"] / found.confidence["viscous-drag"] == pytest.approx(np.exp(2.0 / TEMPER))
     assert sum(found.confidence.values()) == pytest.approx(1)
 
 
@@ -205,7 +205,7 @@ def test_models_that_held_out_runs_do_not_tell_apart_where_none_is_followed_are_
         model("slip-evolution", evidence=100.0, held_out=-np.inf), model("viscous-drag", evidence=90.0, held_out=-np.inf), LOST
     )
     assert (found.verdict, found.effects) == ("identified", ("slip-evolution",))
-    assert found.confidence["slip-evolution"] == pytest.approx(1 - UNEXPLAINED, rel=1e-3)
+    assert found.confidence["slip-evolution"] == pytest.approx((1 - UNEXPLAINED) / (1 + np.exp(-10.0 / TEMPER)), rel=1e-3)
 
 
 def test_held_out_runs_may_choose_a_model_that_fits_worse():
