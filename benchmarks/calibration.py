@@ -12,6 +12,7 @@ drawn again. Whether they hold is seen in cases that did not take part: each fif
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,7 +28,7 @@ from marked import marked
 from srfcli.diagnosis.verdict import MISSED, TEMPER, UNEXPLAINED
 from srfcli.validation.blind import read_answers
 from srfcli.validation.cases import unseal
-from srfcli.validation.marks import Mark, calibrated, calibration_of, holds
+from srfcli.validation.marks import Mark, calibrated, calibration, calibration_of, holds
 
 TEMPERS = np.geomspace(0.5, 60.0, 97)
 LEAST = 0.5  # cases that are added to each side of a share, so that none is 0 or 1 (Jeffreys)
@@ -92,10 +93,13 @@ def fitted(marks: Sequence[Mark], share: Array | None = None) -> Three:
 
 
 def tell(report: Report, who: str, marks: Sequence[Mark]) -> None:
-    """Say mean log score, expected calibration error and the bins of stated confidence."""
-    error = calibration_of(marks)[1]
+    """Say mean log score, expected calibration error with what it would be by chance, and the bins of stated confidence."""
+    error, stated = calibration_of(marks)[1], np.array([m.stated for m in marks])
+    drawn = np.random.default_rng(0).random((DRAWS, stated.size)) < stated  # what a perfect calibration hits
+    chance = float(np.mean([calibration(stated.tolist(), hits.tolist())[1] for hits in drawn]))
     mean = float(np.mean([score(m) for m in marks]))
-    report.say(f"\n{who}: {len(marks)} cases, mean log score {mean:.3f}, expected calibration error {error:.3f}")
+    worth = f"expected calibration error {error:.3f}, by chance {chance:.3f}"
+    report.say(f"\n{who}: {len(marks)} cases, mean log score {mean:.3f}, {worth}")
     table = calibrated(marks)
     rows = [["" if v is None else f"{v:.3g}" for v in row] for row in table.rows]
     report.table([c.name for c in table.columns], rows)
@@ -137,6 +141,9 @@ def main() -> None:
 
     now = (TEMPER, UNEXPLAINED, MISSED)
     report, told = Report("calibration", __doc__ or ""), read(given.trials)
+    for folder in given.trials:
+        trial = json.loads((folder / "trial.json").read_text(encoding="utf-8"))
+        report.say(f"# {trial['bank']} bank of seed {trial['seed']}, answered with a temper of {given.temper:g}")
     marks = untempered(told)
     best, rng = fitted(marks), np.random.default_rng(0)
     share, chosen = shares(marks), rng.integers(len(marks), size=(DRAWS, len(marks)))
@@ -149,8 +156,8 @@ def main() -> None:
     tell(report, "as they would be stated now", [restated(m, now) for m in marks])
     if given.numbers:
         temper, unexplained, missed = given.numbers
-        told = f"by the numbers {temper:g}, {unexplained:g}, {missed:g} of other trials"
-        tell(report, told, [restated(m, (temper, unexplained, missed)) for m in marks])
+        who = f"by the numbers {temper:g}, {unexplained:g}, {missed:g} of other trials"
+        tell(report, who, [restated(m, (temper, unexplained, missed)) for m in marks])
     tell(report, "each fifth by the numbers of the others", by_others(marks))
     for folder in given.check:
         other = untempered(read([folder]))

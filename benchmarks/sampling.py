@@ -77,8 +77,7 @@ def of_fit(name: str, folder: Path, **options: str) -> Target:
     found = srf.fit(srf.read_experiment(folder), **options).found  # type: ignore[arg-type]
     with patch.object(posterior, "draw", lambda *given, **more: given):  # what `sample` would draw from
         log_posterior, _, best, covariance, (lower, upper), _ = posterior.sample(found.state_space, 1)
-    best = np.clip(best, lower + 1e-9 * (upper - lower), upper - 1e-9 * (upper - lower))
-    covariance = posterior._with_bounded(log_posterior, best, covariance, (lower, upper))  # as ours has it of one at its bound
+    best, covariance = posterior._inside(log_posterior, best, covariance, (lower, upper))  # as ours begins
     return Target(name, log_posterior, best, covariance, lower, upper)
 
 

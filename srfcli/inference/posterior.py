@@ -189,14 +189,12 @@ def draw(
         import emcee
     except ImportError as error:
         raise SrfError("`sample` needs emcee, which is not installed", 'pip install "srfcli[sample]"') from error
-    k, (lower, upper) = len(names), bounds
+    k = len(names)
     chains = 2 * k + 4
     every = max(FEWEST_STEPS, -(-EARLY_DRAWS * k // chains))
     rng = np.random.default_rng(seed)
-    width = upper - lower
-    best = np.clip(best, lower + 1e-9 * width, upper - 1e-9 * width)
-    covariance = _with_bounded(log_posterior, best, covariance, bounds)
-    scale = _straight(log_posterior, best, covariance, lower)
+    best, covariance = _inside(log_posterior, best, covariance, bounds)
+    scale = _straight(log_posterior, best, covariance, bounds[0])
 
     def log_density(y: Array) -> float:
         theta = scale.back(y)
@@ -206,7 +204,7 @@ def draw(
     ridge = _Ridge(scale.there(best), root(covariance / np.outer(over, over)))
     moves = [(emcee.moves.MHMove(ridge), INDEPENDENT), (emcee.moves.StretchMove(), 1.0 - INDEPENDENT)]
     drawn = scale.back(ridge.back(rng.standard_normal((chains, k))))
-    start = scale.there(np.clip(drawn, lower + 1e-9 * width, upper - 1e-9 * width))
+    start = scale.there(_within(drawn, bounds))
     sampler = emcee.EnsembleSampler(chains, k, log_density, moves=moves)
     sampler._random = np.random.RandomState(seed)
     steps, burnt, interrupted = max(-(-count // chains), FEWEST_STEPS), 0, False
@@ -235,8 +233,20 @@ def _slowness(chains: Array) -> float:
     return float(steps * count / np.nanmin(np.maximum(effective_size(chains), 1e-9)))
 
 
-def _with_bounded(log_posterior: Callable[[Array], float], best: Array, covariance: Array, bounds: tuple[Array, Array]) -> Array:
-    """Return the covariance with a spread where the fit left a parameter at a bound: there the posterior falls by a half."""
+def _within(theta: Array, bounds: tuple[Array, Array]) -> Array:
+    """Return parameters (..., k) between their bounds, none at one: there the posterior is 0."""
+    margin = 1e-9 * (bounds[1] - bounds[0])
+    return np.clip(theta, bounds[0] + margin, bounds[1] - margin)
+
+
+def _inside(
+    log_posterior: Callable[[Array], float], best: Array, covariance: Array, bounds: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Return the maximum inside its bounds, and the covariance with a spread where the fit left a parameter at a bound.
+
+    So far the posterior falls by a half.
+    """
+    best = _within(best, bounds)
     base, full = log_posterior(best), covariance.copy()
     for k in np.flatnonzero(~(np.diag(covariance) > 0)):
         inwards = 1.0 if best[k] - bounds[0][k] < bounds[1][k] - best[k] else -1.0
@@ -247,7 +257,7 @@ def _with_bounded(log_posterior: Callable[[Array], float], best: Array, covarian
             if log_posterior(theta) >= base - 0.5:
                 break
         full[k], full[:, k], full[k, k] = 0.0, 0.0, reach**2
-    return full
+    return best, full
 
 
 @dataclass(frozen=True)

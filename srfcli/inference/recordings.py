@@ -60,9 +60,10 @@ NO_SCATTER = 0.01  # of the errors: a scatter that stands for none at all
 def _scatter(found: StateSpaceFit) -> dict[str, BetweenGroups | None]:
     """Return how the values of each parameter that varies scatter; None where one is at its bound, its error not known."""
     told: dict[str, BetweenGroups | None] = {}
+    whole = found.covariance
     for n, names in found.likelihood.problem.groups.items():
         places = [found.likelihood.names.index(name) for name in names]
-        covariance = found.covariance[np.ix_(places, places)]
+        covariance = whole[np.ix_(places, places)]
         known = bool((np.diag(covariance) > 0).all())
         told[n] = between_groups(np.array([found.values[name] for name in names]), covariance) if known else None
     return told
