@@ -86,6 +86,7 @@ STEPS = {  # a step: the method that is left out
     "elimination": "_eliminate",
     "further-colour": "_with_more_colour",
     "after-the-best": "_go_on",
+    "other-maxima": "_at_other_maxima",
 }
 
 

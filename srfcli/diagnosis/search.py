@@ -47,6 +47,7 @@ from srfcli.inference.state_space import (
     mass_at_bounds,
     maximise,
     processes_in,
+    scan_narrow,
     thinned,
     wide_starts,
     with_less_colour,
@@ -214,13 +215,13 @@ class ModelSearch:
 
         if move and not self.experiment.runs:  # without a field a parent that is far off leads to the crossings next to its own
             stated = {q.name: q.value for q in self.experiment.parameters}
-            found = fitted(self._started(replace(move, values=stated, shifts={})))
+            found = fitted(self._started(replace(move, values=stated, shifts={}))[1])
             if shortcomings(found):
-                found = max(found, fitted(self._started(move)), key=lambda f: f.log_likelihood)
+                found = max(found, fitted(self._started(move)[1]), key=lambda f: f.log_likelihood)
         elif move and move.origin:
             found = self._as_it_is(move, move.origin.smooth, move.origin.likelihood.processes)
         else:
-            found = fitted(self._started(move) if move else None)
+            found = fitted(self._started(move)[1] if move else None)
             if move and options["processes"] is None:  # its score was taken without field and colour
                 found = max(found, self._as_it_is(move, True, ()), key=lambda f: f.criterion)
         if move and "processes" not in self.options:
@@ -253,8 +254,8 @@ class ModelSearch:
     def _problem(self, hypothesis: Hypothesis, at: Mapping[str, float]) -> Problem:
         return hypothesis.problem(self.registry, self.experiment, at=at, trend=self.trend)
 
-    def _started(self, move: _Move) -> dict[str, float]:
-        """Return where a model is fitted from: the sizes that its scores expect, or a part of them where that is likelier.
+    def _started(self, move: _Move) -> tuple[float, dict[str, float]]:
+        """Return where a model is fitted from, after its log likelihood: the sizes expected, or a part of them if likelier.
 
         With the other parameters moved as the scores say, or as they were.
         """
@@ -274,7 +275,17 @@ class ModelSearch:
                 last = found
         if not best[0] > move.least:
             raise SrfError("no size of it follows the recordings from where its parent stands")
-        return best[1]
+        return best
+
+    def _begun_at(self, move: _Move, node: Fitted) -> _Move:
+        """Return an extension of a fitted model that knows what it reaches where it begins, under the same field and noise."""
+        if np.isfinite(move.reached) or not set(node.fit.values) <= set(move.values):
+            return move
+        try:
+            reached, _ = self._started(replace(move, least=node.fit.log_likelihood))
+        except SrfError:
+            return move
+        return replace(move, reached=node.attainable + self._one_more + reached - node.fit.log_likelihood)
 
     def _sized(self, move: _Move, share: float, shifts: Mapping[str, float]) -> dict[str, float]:
         """Return the parameters of a model where `share` of what its scores expect has been gone."""
@@ -345,7 +356,8 @@ class ModelSearch:
             base = self._expand(self._with_own_noise(base))
             if taken_up(base.fit):  # field or noise make up for what is missing: without them it shows, or it is another law
                 self._take(self._expand_without_field, base)
-                if self._within_reach(base):  # what has been likelier, else what is expected to be
+                if self._within_reach(base):  # what is likelier where it begins, else what is expected to be
+                    self.queue = [self._begun_at(move, base) for move in self.queue]
                     move = max(self.queue, key=lambda m: (max(m.reached, base.evidence), -m.expected))
                     self._fit_next(self._taken_out(move))
                 self._between_runs()
@@ -460,6 +472,7 @@ class ModelSearch:
 
         An effect that was fitted in one run alone, and mends it by halves, is tried in all runs at once, and the reverse.
         """
+        steps = (self._at_other_maxima, self._with_more_colour)
         while not self.spent:
             self._between_runs()
             best = self.best()
@@ -467,8 +480,8 @@ class ModelSearch:
             heapq.heapify(self.queue)
             if self._within_reach(best):
                 self._fit_next(heapq.heappop(self.queue))
-            elif (self._with_more_colour, best.name) not in self._taken:
-                self._take(self._with_more_colour, best)
+            elif step := next((s for s in steps if (s, best.name) not in self._taken), None):
+                self._take(step, best)
             elif not self._expandable(best):
                 break
             elif best.passes or (self._fit_afresh, self.baseline.name) in self._taken:
@@ -477,9 +490,10 @@ class ModelSearch:
                 self._take(self._fit_afresh, self.baseline)
 
     def _between_runs(self) -> None:
-        """Fit the best model, while it fails a test, with its effects in all runs and with each in one run."""
+        """Fit the best model, while it fails a test, at other maxima, with its effects in all runs and with each in one run."""
+        steps = (self._at_other_maxima, self._in_all_runs, self._in_one_run)
         while not (best := self.best()).passes:
-            step = next((s for s in (self._in_all_runs, self._in_one_run) if (s, best.name) not in self._taken), None)
+            step = next((s for s in steps if (s, best.name) not in self._taken), None)
             if step is None:
                 return
             self._take(step, best)
@@ -825,6 +839,16 @@ class ModelSearch:
         noise_anew = node.fit.likelihood.processes and not likelihood.processes
         values = {n: v for n, v in found.point.values.items() if not (noise_anew and n.startswith("gauge_"))}
         return _Move(-expected, self.count, hypothesis, values, _sizes_of(hypothesis, likelihood.problem.model, values))
+
+    def _at_other_maxima(self, best: Fitted) -> None:
+        """Fit the best model anew where a scan of one parameter finds a likelier maximum; the baseline's fit began with one."""
+        problem, processes = best.fit.likelihood.problem, best.fit.likelihood.processes
+        if best.hypothesis.reported and problem.runs:
+            rough = Likelihood(problem, processes=processes, rtol=SEARCH_RTOL)
+            begun = rough.at(rough.coordinates(best.fit.values))
+            if found := scan_narrow(rough, begun, self.progress):
+                fit = self._state_space(problem, part=StateSpaceFit(rough, found), processes=processes)
+                self._record(self._judged(best.hypothesis, fit))
 
     def _in_all_runs(self, best: Fitted) -> None:
         """Fit the best model with its effects in all runs: the score of one run may have been misled by what was missing then."""

@@ -1478,7 +1478,7 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
         tops = [maximise(likelihood, points[k], held=[name], steps=PEAK_STEPS, widths=()).point for k in likely]
         if tops:
             top = max(tops, key=lambda p: p.log_likelihood)
-            other = maximise(likelihood, top.x, steps=SCORING_STEPS // 2, close=1.0, widths=())
+            other = maximise(likelihood, top.x, steps=SCORING_STEPS // 2, close=1.0, widths=(), progress=progress)
             height = other.point.log_likelihood
             progress(f"log likelihood {height:.1f} by a scan of {name}, {begun.log_likelihood:.1f} before")
             if height > highest:

@@ -214,6 +214,7 @@ def _ratio(answer: Answer, sight: Sight, model: str) -> float | None:
 # Visibility, from the truth of a case: the error of the true model, and the size of each effect in standard errors.
 
 PARAMETER_STEP = 2e-4  # relative, of a parameter's difference: in stick-slip a larger one shifts the phase by more than is linear
+COEFFICIENTS = ("mu0", "A", "B", "B2", "C", "M")  # what goes with the stiffness in a recording of elongations
 
 
 @dataclass(frozen=True)
@@ -258,18 +259,22 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
 
     `sliders` are the runs and what is true in each. The baseline's parameters and the sizes of the `others` are free to first
     order, from the slider without the effect. A random friction field is taken as known: where it is not, less is
-    seen. Where no mass is known, a wrong stiffness does not stand out of elongations at all: they are those of mu0, A, B and M
-    over the ratio and lambda times it.
+    seen. Elongations of a wrong stiffness are held against those of lambda times its ratio and of the friction coefficients,
+    and a mass that is free, over it: without inertia they are the same.
     """
-    signals, tangents = [], []
+    signals, tangents, raw = [], [], 0.0
     bare = {plan: effect.removed(p) for plan, p in sliders.items()}
     free = free_fields(next(iter(bare.values())))
     free += [o.varies for o in others if o.varies not in free and any(getattr(p, o.varies) for p in bare.values())]
     for plan, p in sliders.items():
-        less = bare[plan]
+        less, shows = bare[plan], unread(rig, p, plan)
+        raw = float(np.hypot(raw, np.linalg.norm(white(shows - unread(rig, less, plan), gauge.louder(plan.loud)))))
+        if effect.varies == "ratio" and rig.observes == "elongation":
+            scaled = [n for n in COEFFICIENTS if n != "M" or any(o.varies == n for o in others)]
+            less = replace(less, lam=less.lam * p.ratio, **{n: getattr(less, n) / p.ratio for n in scaled})
         base = unread(rig, less, plan)
         moved = [unread(rig, replace(less, **{n: getattr(less, n) * (1 + PARAMETER_STEP)}), plan) for n in free]
-        signal = unread(rig, p, plan) - base
+        signal = shows - base
         tangent = np.column_stack([(x - base) / PARAMETER_STEP for x in moved])
         if not (np.isfinite(signal).all() and np.isfinite(tangent).all()):
             return None, None
@@ -277,12 +282,9 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
         signals.append(whitened[:, 0])
         tangents.append(whitened[:, 1:])
     signal, tangent = np.concatenate(signals), np.concatenate(tangents)
-    massless = any(p.massless for p in bare.values()) or any(o.varies == "M" for o in others)
-    if effect.varies == "ratio" and rig.observes == "elongation" and massless:
-        return 0.0, float(np.linalg.norm(signal))
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=0), 1e-12)
     left = signal - tangent @ np.linalg.lstsq(tangent, signal, rcond=1e-10)[0]
-    return float(np.linalg.norm(left)), float(np.linalg.norm(signal))
+    return float(np.linalg.norm(left)), raw
 
 
 def see_all(bank: Path, truths: Mapping[str, Mapping[str, Any]], *, workers: int, kept: Path) -> Iterator[Sight]:
