@@ -841,14 +841,33 @@ class ModelSearch:
         return _Move(-expected, self.count, hypothesis, values, _sizes_of(hypothesis, likelihood.problem.model, values))
 
     def _at_other_maxima(self, best: Fitted) -> None:
-        """Fit the best model anew where a scan of one parameter finds a likelier maximum; the baseline's fit began with one."""
+        """Fit the best model anew where a scan of one parameter, or another mass or compliance, leads to a likelier maximum.
+
+        The fit of the baseline began with a scan.
+        """
         problem, processes = best.fit.likelihood.problem, best.fit.likelihood.processes
-        if best.hypothesis.reported and problem.runs:
-            rough = Likelihood(problem, processes=processes, rtol=SEARCH_RTOL)
-            begun = rough.at(rough.coordinates(best.fit.values))
-            if found := scan_narrow(rough, begun, self.progress):
-                fit = self._state_space(problem, part=StateSpaceFit(rough, found), processes=processes)
-                self._record(self._judged(best.hypothesis, fit))
+        if not best.hypothesis.reported or not problem.runs:
+            return
+        rough = Likelihood(problem, processes=processes, rtol=SEARCH_RTOL)
+        begun = rough.at(rough.coordinates(best.fit.values))
+        found = scan_narrow(rough, begun, self.progress) or replace(best.fit.maximum, point=begun)
+        for effect in (e for e in best.hypothesis.effects if e.settings):
+            size = next(name for name in (*own_parameters(effect, problem.model), *effect.frees) if name in rough.names)
+            found = self._at_another_size(rough, found, size)
+        if found.point is not begun:
+            fit = self._state_space(problem, part=StateSpaceFit(rough, found), processes=processes)
+            self._record(self._judged(best.hypothesis, fit))
+
+    def _at_another_size(self, likelihood: Likelihood, found: Maximum, size: str) -> Maximum:
+        """Return the maximum that halving or doubling a size leads to, again and again, as long as each is likelier."""
+        place = likelihood.names.index(size)
+        for side in (-1, 1):
+            x = found.point.x.copy()
+            x[place] = np.clip(x[place] + side * np.log(2), likelihood.lower[place], likelihood.upper[place])
+            other = maximise(likelihood, x, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
+            if other.point.log_likelihood > found.point.log_likelihood + NEEDED:
+                return self._at_another_size(likelihood, other, size)
+        return found
 
     def _in_all_runs(self, best: Fitted) -> None:
         """Fit the best model with its effects in all runs: the score of one run may have been misled by what was missing then."""
