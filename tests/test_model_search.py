@@ -28,7 +28,7 @@ from srfcli.inference.state_space import (
     maximise,
 )  # fmt: skip
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.cases import case_files
+from srfcli.validation.cases import case_files, make_case
 from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, Track, move
 
@@ -180,6 +180,18 @@ def test_where_nothing_passes_the_models_after_the_best_are_expanded(ageing):
     singles = [f for f in search.fitted.values() if len(f.hypothesis.effects) < MOST_EFFECTS]
     assert not search.best().passes and len(singles) > 2 and not search.cut_short
     assert all(f.scores for f in singles) and not search.queue
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "kind", "concealed"), [(75, "pair", "load-distortion+inertia"), (99, "single", "load-transmission")]
+)
+def test_the_right_model_is_left_at_no_wrong_maximum(tmp_path, number, kind, concealed):
+    """The contact rings faster than it is sampled: a mass that fits 229 below its maximum, a compliance 2.5 % off."""
+    names = tuple(concealed.split("+"))
+    make_case(tmp_path / "case", (97310514, number), kind=kind, effects=names, strengths=False, bank="wide")
+    found = said(tmp_path / "case", effects=None)
+    assert found.verdict == "identified" and set(found.effects) == set(names)
 
 
 @pytest.mark.slow
