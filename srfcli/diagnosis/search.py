@@ -215,13 +215,13 @@ class ModelSearch:
 
         if move and not self.experiment.runs:  # without a field a parent that is far off leads to the crossings next to its own
             stated = {q.name: q.value for q in self.experiment.parameters}
-            found = fitted(self._started(replace(move, values=stated, shifts={}))[1])
+            found = fitted(self._started(replace(move, values=stated, shifts={})))
             if shortcomings(found):
-                found = max(found, fitted(self._started(move)[1]), key=lambda f: f.log_likelihood)
+                found = max(found, fitted(self._started(move)), key=lambda f: f.log_likelihood)
         elif move and move.origin:
             found = self._as_it_is(move, move.origin.smooth, move.origin.likelihood.processes)
         else:
-            found = fitted(self._started(move)[1] if move else None)
+            found = fitted(self._started(move) if move else None)
             if move and options["processes"] is None:  # its score was taken without field and colour
                 found = max(found, self._as_it_is(move, True, ()), key=lambda f: f.criterion)
         if move and "processes" not in self.options:
@@ -254,8 +254,8 @@ class ModelSearch:
     def _problem(self, hypothesis: Hypothesis, at: Mapping[str, float]) -> Problem:
         return hypothesis.problem(self.registry, self.experiment, at=at, trend=self.trend)
 
-    def _started(self, move: _Move) -> tuple[float, dict[str, float]]:
-        """Return where a model is fitted from, after its log likelihood: the sizes expected, or a part of them if likelier.
+    def _started(self, move: _Move) -> dict[str, float]:
+        """Return where a model is fitted from: the sizes that its scores expect, or a part of them where that is likelier.
 
         With the other parameters moved as the scores say, or as they were.
         """
@@ -275,17 +275,7 @@ class ModelSearch:
                 last = found
         if not best[0] > move.least:
             raise SrfError("no size of it follows the recordings from where its parent stands")
-        return best
-
-    def _begun_at(self, move: _Move, node: Fitted) -> _Move:
-        """Return an extension of a fitted model that knows what it reaches where it begins, under the same field and noise."""
-        if np.isfinite(move.reached) or not set(node.fit.values) <= set(move.values):
-            return move
-        try:
-            reached, _ = self._started(replace(move, least=node.fit.log_likelihood))
-        except SrfError:
-            return move
-        return replace(move, reached=node.attainable + self._one_more + reached - node.fit.log_likelihood)
+        return best[1]
 
     def _sized(self, move: _Move, share: float, shifts: Mapping[str, float]) -> dict[str, float]:
         """Return the parameters of a model where `share` of what its scores expect has been gone."""
@@ -357,8 +347,7 @@ class ModelSearch:
             if taken_up(base.fit):  # field or noise make up for what is missing: without them it shows, or it is another law
                 self._take(self._expand_without_field, base)
                 if self._within_reach(base):  # what is likelier where it begins, else what is expected to be
-                    self.queue = [self._begun_at(move, base) for move in self.queue]
-                    move = max(self.queue, key=lambda m: (max(m.reached, base.evidence), -m.expected))
+                    move = max(self.queue, key=lambda m: (max(self._reached(m, base), base.evidence), -m.expected))
                     self._fit_next(self._taken_out(move))
                 self._between_runs()
                 if self.best().name == base.name or not self.best().passes:
@@ -721,6 +710,12 @@ class ModelSearch:
         for shifts in ({}, {n: ratio * shift for n, shift in score.shifts.items() if n != names[size]}):
             yield _Move(0.0, 0, hypothesis, dict(fitted), sizes, shifts=shifts, origin=node.fit)
 
+    def _reached(self, move: _Move, node: Fitted) -> float:
+        """Return the log evidence that an extension of a fitted model has where it begins; -inf under another field or noise."""
+        kept = node.fit.values.keys() <= move.values.keys()
+        gain = self._height(replace(move, origin=node.fit)) - node.fit.log_likelihood if kept else -np.inf
+        return max(move.reached, node.attainable + self._one_more + gain)
+
     def _height(self, move: _Move) -> float:
         """Return the log likelihood where a move begins, field and noise as in the fit that it comes from."""
         assert move.origin is not None
@@ -852,8 +847,8 @@ class ModelSearch:
         begun = rough.at(rough.coordinates(best.fit.values))
         found = scan_narrow(rough, begun, self.progress) or replace(best.fit.maximum, point=begun)
         for effect in (e for e in best.hypothesis.effects if e.settings):
-            size = next(name for name in (*own_parameters(effect, problem.model), *effect.frees) if name in rough.names)
-            found = self._at_another_size(rough, found, size)
+            sizes = [n for n in (*own_parameters(effect, problem.model), *effect.frees) if n in rough.names]
+            found = self._at_another_size(rough, found, sizes[0]) if sizes else found
         if found.point is not begun:
             fit = self._state_space(problem, part=StateSpaceFit(rough, found), processes=processes)
             self._record(self._judged(best.hypothesis, fit))
