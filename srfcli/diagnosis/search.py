@@ -390,6 +390,10 @@ class ModelSearch:
         step(node)
         self._taken.add((step, node.name))
 
+    def _untaken(self, node: Fitted, *steps: Callable[[Fitted], Any]) -> Callable[[Fitted], Any] | None:
+        """Return the first of several steps that was not taken yet for a model; None where all were."""
+        return next((step for step in steps if (step, node.name) not in self._taken), None)
+
     def _steps(self) -> list[_Step]:
         """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
         best, base = self.best(), self.baseline
@@ -461,7 +465,6 @@ class ModelSearch:
 
         An effect that was fitted in one run alone, and mends it by halves, is tried in all runs at once, and the reverse.
         """
-        steps = (self._at_other_maxima, self._with_more_colour)
         while not self.spent:
             self._between_runs()
             best = self.best()
@@ -469,7 +472,7 @@ class ModelSearch:
             heapq.heapify(self.queue)
             if self._within_reach(best):
                 self._fit_next(heapq.heappop(self.queue))
-            elif step := next((s for s in steps if (s, best.name) not in self._taken), None):
+            elif step := self._untaken(best, self._at_other_maxima, self._with_more_colour):
                 self._take(step, best)
             elif not self._expandable(best):
                 break
@@ -481,10 +484,7 @@ class ModelSearch:
     def _between_runs(self) -> None:
         """Fit the best model, while it fails a test, at other maxima, with its effects in all runs and with each in one run."""
         steps = (self._at_other_maxima, self._in_all_runs, self._in_one_run)
-        while not (best := self.best()).passes:
-            step = next((s for s in steps if (s, best.name) not in self._taken), None)
-            if step is None:
-                return
+        while not (best := self.best()).passes and (step := self._untaken(best, *steps)):
             self._take(step, best)
 
     def _fit_next(self, move: _Move) -> None:

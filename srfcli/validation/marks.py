@@ -268,11 +268,12 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
     free += [o.varies for o in others if o.varies not in free and any(getattr(p, o.varies) for p in bare.values())]
     for plan, p in sliders.items():
         less, shows = bare[plan], unread(rig, p, plan)
-        raw = float(np.hypot(raw, np.linalg.norm(white(shows - unread(rig, less, plan), gauge.louder(plan.loud)))))
+        base = unread(rig, less, plan)
+        raw = float(np.hypot(raw, np.linalg.norm(white(shows - base, gauge.louder(plan.loud)))))
         if effect.varies == "ratio" and rig.observes == "elongation":
             scaled = [n for n in COEFFICIENTS if n != "M" or any(o.varies == n for o in others)]
             less = replace(less, lam=less.lam * p.ratio, **{n: getattr(less, n) / p.ratio for n in scaled})
-        base = unread(rig, less, plan)
+            base = unread(rig, less, plan)
         moved = [unread(rig, replace(less, **{n: getattr(less, n) * (1 + PARAMETER_STEP)}), plan) for n in free]
         signal = shows - base
         tangent = np.column_stack([(x - base) / PARAMETER_STEP for x in moved])
