@@ -26,7 +26,7 @@ def main() -> None:
     try:
         truth = make_case(
             options.out, options.seed, kind=None if options.effects else "none", effects=options.effects or None,
-            size=options.size, rough=options.rough, strengths=False,
+            size=options.size, rough=options.rough,
         )  # fmt: skip
     except SrfError as error:
         parser.exit(2, f"Error: {error.message}\nTry: {error.hint}\n")

@@ -1,8 +1,22 @@
-"""The runs of the worked examples, for tests of the generator."""
+"""The runs of the worked examples, two short ones, and their noise, for tests of the generator."""
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from srfcli.validation.slider import Plan
+
+NOISE = float(np.hypot(0.02, 0.005 / np.sqrt(12)))  # um, of a gauge and its quanta
+SHORT = (
+    Plan("wave", ((0.5, 20.0),), 7.0, 0.001, eps=0.2, f=110.0, onset=0.25),
+    Plan("steps", ((0.8, 20.0), (0.8, 40.0), (1.0, 5.0)), 5.0, 0.004, steps=((1.2, 1.5),)),
+)
+
+
+def rms(x: ArrayLike) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(x))))
 
 
 def example_protocol() -> tuple[Plan, ...]:

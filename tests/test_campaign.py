@@ -11,22 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from commands import srf
 
 import srfcli
-from srfcli.cli.main import cli
 from srfcli.tasks.recordings import fit_campaign
 
 Ended = Callable[..., tuple[int, str, str]]
 pytestmark = pytest.mark.usefixtures("empty_folder")
 TRUE = {"A": 0.009, "B": 0.006, "D0": 6.0}
 K, LOAD = 4e-3, 20.0  # 1/um, MPa
-
-
-def srf(*arguments: str, code: int = 0) -> Result:
-    done = CliRunner().invoke(cli, list(arguments), prog_name="srf")
-    assert done.exit_code == code, done.stderr
-    return done
 
 
 def experiment(name: str, *, seed: int, drift: float = 0.0) -> Path:

@@ -13,11 +13,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from commands import srf
 from recording_cases import TOML, data, write
 from scipy.linalg import cho_factor, cho_solve
 
-from srfcli.cli.main import cli
 from srfcli.codegen.model import open_model
 from srfcli.data.experiment import check_run, read_experiment
 from srfcli.data.gauge import GaugeNoise, with_slower
@@ -33,12 +32,6 @@ REGISTRY = load_registry(user=False, entry_points=False)
 
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
-
-
-def srf(*arguments: str, code: int = 0) -> Result:
-    done = CliRunner().invoke(cli, list(arguments), prog_name="srf")
-    assert done.exit_code == code, done.stderr
-    return done
 
 
 def told(experiment: Experiment, *, apparatus: bool = False, **more: int) -> Forecast:

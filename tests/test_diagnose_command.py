@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli
-from click.testing import CliRunner, Result
+from commands import srf
 
 import srfcli
-from srfcli.cli.main import cli
 from srfcli.core.errors import SrfError
 from srfcli.diagnosis.verdict import UNEXPLAINED
 from srfcli.results.diagnosis import prediction_names
@@ -53,12 +52,6 @@ KEYS = {
     "schema", "verdict", "effects", "equivalent", "not_identifiable", "confidence", "baseline", "augmented", "location",
     "model",
 }  # fmt: skip
-
-
-def srf(*arguments: object, code: int = 0) -> Result:
-    done = CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="srf")
-    assert done.exit_code == code, done.stderr
-    return done
 
 
 def make(folder: Path) -> Path:

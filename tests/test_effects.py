@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from example_protocol import example_protocol
+from example_protocol import NOISE, example_protocol, rms
 
 from srfcli.codegen.model import open_model
 from srfcli.data.experiment import read_experiment
@@ -30,7 +30,6 @@ BRIEF = PLANS | {
     "strong": replace(PLANS["strong"], drive=((0.6, 20),), onset=0.2),
     "loadstep": replace(PLANS["loadstep"], drive=((3, 10),), steps=((1, 1.5), (2, -1.5))),
 }
-NOISE = float(np.hypot(0.02, 0.005 / np.sqrt(12)))  # um, of a gauge and its quanta
 # the generator's names for the fitter's parameters
 BASE = {"mu0": "mu0", "A": "A", "B": "B", "D0": "D0", "V0": "V0", "Vsat": "Vsat", "lam": "lambda"}
 FIELDS = {
@@ -53,10 +52,6 @@ MATTERS = {"track-topography": ("steps", "loadstep")} | {
 
 RTOL = 1e-8  # of the generator's solver, which is then up to 7e-5 um off, on one processor more than on another
 moved = cache(move)  # most effects have the same baseline
-
-
-def rms(x):
-    return float(np.sqrt(np.mean(np.square(x))))
 
 
 def registered(varies: str, name: str) -> str:

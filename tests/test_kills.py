@@ -18,7 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
+from commands import srf
 
 from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiler
@@ -30,12 +31,6 @@ pytestmark = [
 
 STEPS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.chmod", "tempfile.mkstemp", "tempfile.mkdtemp"}
 STEPS |= {"os.truncate", "fcntl.flock", "shutil.rmtree"}
-
-
-def srf(*arguments: str, code: int = 0) -> Result:
-    done = CliRunner().invoke(cli, arguments, prog_name="srf")
-    assert done.exit_code == code, done.output
-    return done
 
 
 def forked(work: Callable[[], int]) -> int:

@@ -109,31 +109,23 @@ def test_folds_lie_where_crossings_appear(model, boundary):
     assert counts == [2, 0]
 
 
-@pytest.mark.parametrize(("eps", "count"), [(0.18, 2), pytest.param(0.4, 4, marks=pytest.mark.slow)])
-def test_a_second_method_finds_the_same_components(model, eps, count):
-    """A map, and curves from lines on a finer mesh with other seeds and shorter steps."""
+@pytest.mark.parametrize(
+    ("law", "eps", "count"),
+    [("srf-vsat", 0.18, 2), pytest.param("srf-vsat", 0.4, 4, marks=pytest.mark.slow), ("log-log", 0.18, None),
+     ("bowden-tabor", 0.18, None)],
+)  # fmt: skip
+def test_a_second_method_finds_the_same_components(model, make_model, law, eps, count):
+    """A map, and curves from lines on a finer mesh with other seeds and shorter steps; with folds among them."""
+    model = model if law == "srf-vsat" else make_model(law=law)  # with parameters as shipped
     grid = window(model, eps, 30, 40, ratio=(0.21 / 200, 0.21 / 8))
     boundary = finished(model, compute_map(model, grid, MapSettings(depth=2)))
     other = ContinuationSettings(lines=9, samples=100, tol=1e-5, steps=StepSettings(largest=0.025, mesh_error=5e-5))
     *_, second = find_components(model, Plane(grid.base, Axis("V", 1.0, 100.0), Axis("W0", 8.0, 200.0)), other)
-    assert len(boundary.branches) == len(second.branches) == count
+    assert len(boundary.branches) == len(second.branches) == (count or len(second.branches)) > 0
     assert extents(model, boundary)[:, :2] == pytest.approx(extents(model, second)[:, :2], rel=1e-3)
-    if count == 2:
-        assert special_folds(model, boundary) == pytest.approx(special_folds(model, second), rel=1e-5)
-
-
-@pytest.mark.parametrize("law", ["log-log", "bowden-tabor"])
-def test_the_second_method_agrees_for_other_laws(make_model, law):
-    """The same, folds among it, for laws whose parameters are as shipped, around the low loads where they fold."""
-    model = make_model(law=law)
-    grid = window(model, 0.18, 30, 40, ratio=(0.21 / 200, 0.21 / 8))
-    boundary = finished(model, compute_map(model, grid, MapSettings(depth=2)))
-    other = ContinuationSettings(lines=9, samples=100, tol=1e-5, steps=StepSettings(largest=0.025, mesh_error=5e-5))
-    *_, second = find_components(model, Plane(grid.base, Axis("V", 1.0, 100.0), Axis("W0", 8.0, 200.0)), other)
-    assert len(boundary.branches) == len(second.branches) > 0
-    assert extents(model, boundary)[:, :2] == pytest.approx(extents(model, second)[:, :2], rel=1e-3)
-    folds = special_folds(model, boundary)
-    assert folds and folds == pytest.approx(special_folds(model, second), rel=1e-5)
+    if eps < 0.4:
+        folds = special_folds(model, boundary)
+        assert folds and folds == pytest.approx(special_folds(model, second), rel=1e-5)
 
 
 def special_folds(model, boundary):
@@ -225,17 +217,6 @@ def test_an_interrupted_map_keeps_what_is_finished(model):
     done = np.isfinite(part.leading)
     assert 0 < done.sum() < done.size
     assert (part.leading[done] == whole.leading[done]).all()
-
-
-def test_a_point_without_an_orbit_says_so(model):
-    """A modulation that lifts nearly all the load leaves no orbit on the meshes allowed."""
-    grid = window(model, 0.97, 2, 2, V=(1.0, 1.2), ratio=(0.005, 0.0052))
-    found = compute_map(model, grid, MapSettings(finest=12, depth=0))
-    lost = ~np.isfinite(found.leading)
-    assert found.lost == lost.sum()
-    assert (found.kind[lost] == STABILITY_KINDS.index("unresolved")).all()
-    if found.lost:
-        assert any("no forced periodic state" in note for note in finished(model, found).notes)
 
 
 @pytest.mark.parametrize(

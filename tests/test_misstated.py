@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from commands import srf
 
 import srfcli
-from srfcli.cli.main import cli
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import Diagnosis, conclude
 from srfcli.laws.registry import load_registry
@@ -21,12 +20,6 @@ from srfcli.results.diagnosis import DiagnosisResult
 RIG = ("--law", "dieterich-ruina", "--interface", "rigid", "--no-inertia", "--K", "0.1 N/um", "--W0", "10")
 LAW = ("--set", "mu0=0.6", "--set", "A=0.008", "--set", "B=0.011", "--set", "D0=5")
 GAUGE = ("--observe", "force", "--noise", "0.003", "--free", "mu0,A,B,D0", "--seed", "1")
-
-
-def srf(*arguments: object, code: int = 0) -> Result:
-    done = CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="srf")
-    assert done.exit_code == code, (done.output, done.exception)
-    return done
 
 
 def record(out: Path, *more: object, law: Sequence[str] = LAW, drive: str = "20:4,15:12,20:4") -> Path:

@@ -189,7 +189,7 @@ def test_where_nothing_passes_the_models_after_the_best_are_expanded(ageing):
 def test_the_right_model_is_left_at_no_wrong_maximum(tmp_path, number, kind, concealed):
     """The contact rings faster than it is sampled: a mass that fits 229 below its maximum, a compliance 2.5 % off."""
     names = tuple(concealed.split("+"))
-    make_case(tmp_path / "case", (97310514, number), kind=kind, effects=names, strengths=False, bank="wide")
+    make_case(tmp_path / "case", (97310514, number), kind=kind, effects=names, bank="wide")
     found = said(tmp_path / "case", effects=None)
     assert found.verdict == "identified" and set(found.effects) == set(names)
 

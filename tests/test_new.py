@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
+from commands import srf
 
 import srfcli
 from srfcli.cli.main import cli
@@ -26,12 +27,6 @@ k = 2e-3  # 1/um
 SIGMA = 20.0  # MPa
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
-
-
-def srf(*arguments: str, code: int = 0) -> Result:
-    done = CliRunner().invoke(cli, list(arguments), prog_name="srf")
-    assert done.exit_code == code, done.stderr
-    return done
 
 
 def steps() -> dict[str, np.ndarray]:

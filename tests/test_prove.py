@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli
+from example_protocol import SHORT
 from hypothesis import given
 from hypothesis import strategies as st
 from in_workers import careless, deadly_at_one, peeks, remembers, says_none
@@ -43,14 +44,10 @@ from srfcli.validation.blind import (
 from srfcli.validation.cases import BANKS, NAMES, PAPER_KINDS, WIDE_KINDS, make_case, plan_bank, possible_pairs, variants
 from srfcli.validation.gauge import Gauge
 from srfcli.validation.marks import INVISIBLE, Rate, Sight, accepted, calibration, deviation, mark, quantile, see, stands_out
-from srfcli.validation.slider import Physics, Plan, move
+from srfcli.validation.slider import Physics, move
 from srfcli.validation.trials import Trial, answer_all, begin, open_truths, prove
 
 ROOT = Path(__file__).resolve().parents[1]
-SHORT = (
-    Plan("wave", ((0.5, 20.0),), 7.0, 0.001, eps=0.2, f=110.0, onset=0.25),
-    Plan("steps", ((0.8, 20.0), (0.8, 40.0), (1.0, 5.0)), 5.0, 0.004, steps=((1.2, 1.5),)),
-)
 SHORTEST = {"bank": "wide", "seed": 6}  # of cases whose runs cost little
 SURE = {"none": 0.0, "unknown": 0.01}
 
@@ -426,7 +423,7 @@ def test_a_wrong_stiffness_stands_out_of_elongations_by_the_mass_alone():
 
 def test_the_true_model_leaves_the_noise(tmp_path):
     plans = (SHORT[1], replace(SHORT[0], holdout=True))
-    truth = make_case(tmp_path / "c", 5, plans=plans, effects=[ALPHA, "friction-drift"], size=0.9, rough=2e-4, strengths=False)
+    truth = make_case(tmp_path / "c", 5, plans=plans, effects=[ALPHA, "friction-drift"], size=0.9, rough=2e-4)
     found = see((tmp_path / "c", truth))
     assert set(found.known) == {"wave"}  # the held-out run
     assert 0.85 < found.known["wave"] / np.hypot(0.02, 0.005 / np.sqrt(12)) < 1.15
@@ -517,17 +514,6 @@ def test_tampering_is_told(new_trial, tmp_path):
         list(answer_all(trial, diagnose=says_none))
 
 
-def test_a_bank_that_was_cut_short_is_made_again(new_trial, tmp_path):
-    whole, cut = new_trial(tmp_path / "a", 2), Trial(tmp_path / "b")
-    cut.folder.mkdir()
-    for name in ("trial.json", "truths.json"):
-        (cut.folder / name).write_bytes((whole.folder / name).read_bytes())
-    (cut.folder / "bank.part" / "case-000").mkdir(parents=True)
-    again = begin(cut.folder, cases=None, seed=None, kinds=(), resume=True, workers=1)
-    assert again.digest() == whole.digest()
-    assert sorted(p.name for p in cut.folder.iterdir()) == ["bank", "trial.json", "truths.json"]
-
-
 @pytest.mark.parametrize("at", ["before the note", "before the bank's rename", "after it"])
 def test_a_trial_that_was_killed_ends_as_one_that_was_not(new_trial, tmp_path, at):
     whole, cut = new_trial(tmp_path / "a", 1), Trial(tmp_path / "b")
@@ -542,7 +528,8 @@ def test_a_trial_that_was_killed_ends_as_one_that_was_not(new_trial, tmp_path, a
         cut.bank.rename(cut.folder / "bank.part")
         next((cut.folder / "bank.part").glob("case-*/*.csv")).write_text("cut sh")
     before = cut.bank.stat().st_mtime_ns if cut.bank.exists() else None
-    begin(cut.folder, cases=1, **SHORTEST, kinds=(), resume=True, workers=1)
+    asked = {"cases": 1, **SHORTEST} if at == "before the note" else {"cases": None, "seed": None}  # else the note has them
+    begin(cut.folder, **asked, kinds=(), resume=True, workers=1)
     assert before in (None, cut.bank.stat().st_mtime_ns)
     assert (cut.digest(), cut.waiting()) == (whole.digest(), ["case-000"])
     (cut.folder / ".answers.jsonl.abcdefgh.part").write_text('{"case": "case-0')  # killed while it wrote the first
@@ -730,7 +717,7 @@ def test_an_interrupt_keeps_what_was_answered(tmp_path):
 @pytest.mark.slow
 def test_one_real_case_from_bank_to_mark(tmp_path):
     """A strong drift, told by nothing but its recordings."""
-    truth = make_case(tmp_path / "case-000", 21, effects=["friction-drift"], size=0.9, rough=False, strengths=False)
+    truth = make_case(tmp_path / "case-000", 21, effects=["friction-drift"], size=0.9, rough=False)
     answer = answer_case(Task(tmp_path / "case-000", (), diagnose_case, 1800.0))
     found = mark(truth, answer, see((tmp_path / "case-000", truth)))
     assert (answer.failure, answer.verdict, found.right) == ("", "identified", True)

@@ -213,18 +213,15 @@ def test_a_flaw_is_told_of_its_own_kind_alone(kind: str, tmp_path: Path) -> None
     assert np.isfinite(experiment.runs[0].observed).all()
 
 
-@pytest.mark.parametrize("kind", FLAWS)
+@pytest.mark.parametrize("kind", ["gap", "modulation-differs", "start-value"])
 def test_fail_on_a_kind(kind: str, tmp_path: Path) -> None:
-    """Exit code 4 for the kind that is there; for all others together 0, which three kinds of notices show."""
+    """Exit code 4 for the kind that is there; for all others together 0."""
     make, _ = FLAWS[kind]
     columns = Columns()
     make(columns)
     folder = columns.written(tmp_path)
     others = [word for k in NOTICE_KINDS if k != kind for word in ("--fail-on", k)]
-    for asked, code in (
-        (["--fail-on", kind], 4),
-        *([(others, 0)] if kind in ("gap", "modulation-differs", "start-value") else []),
-    ):
+    for asked, code in ((["--fail-on", kind], 4), (others, 0)):
         done = CliRunner().invoke(cli, ["check", str(folder), "--no-simulate", *asked], prog_name="srf")
         assert done.exit_code == code, done.stderr
         assert f"{kind}: " in done.stdout

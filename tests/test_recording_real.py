@@ -7,20 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from commands import srf
 
-from srfcli.cli.main import cli
 from srfcli.data.experiment import read_experiment
 from srfcli.data.gauge import GaugeNoise
 from srfcli.laws.registry import load_registry
 
 REGISTRY = load_registry(user=False, entry_points=False)
-
-
-def srf(*arguments: str, code: int = 0) -> Result:
-    done = CliRunner().invoke(cli, list(arguments), prog_name="srf")
-    assert done.exit_code == code, done.stderr
-    return done
 
 
 def real(folder: Path, data_: Path, *, columns: str, run: str, stiffness: str = "1.6e-3 1/um") -> Path:

@@ -6,19 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from commands import srf
 from test_report import BROWSER, WIDTHS, Page, laid_out
-
-from srfcli.cli.main import cli
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 HOSTILE = '<script>alert("1")</script>'
-
-
-def srf(*arguments: str, code: int = 0) -> Result:
-    done = CliRunner().invoke(cli, list(arguments), prog_name="srf")
-    assert done.exit_code == code, done.stderr
-    return done
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import csv
 import io
 import json
 import math
-import os
 import re
 import threading
 import time
@@ -261,25 +260,14 @@ def test_start_values_can_be_off(empty_folder: Path) -> None:
 
 def test_noise_rounding_and_seed() -> None:
     clean = columns(*SHS)["u"]
-    simulate(
-        *SHS,
-        "--noise",
-        "20 nm".replace("20 nm", "0.02 um"),
-        "--lag1",
-        "0.8",
-        "--quantum",
-        "0.005",
-        "--seed",
-        "4",
-        "--out-dir",
-        "made",
-    )
+    gauge = ("--noise", "0.02", "--lag1", "0.8", "--quantum", "0.005", "--seed", "4")
+    simulate(*SHS, *gauge, "--out-dir", "made")
     run = read("made").runs[0]
     rest = run.observed - clean
     assert rest.std() == pytest.approx(0.02, rel=0.05)
     assert np.corrcoef(rest[1:], rest[:-1])[0, 1] == pytest.approx(0.8, abs=0.03)
     assert run.observed * 200 == pytest.approx(np.round(run.observed * 200), abs=1e-9)
-    again = columns(*SHS, "--noise", "0.02", "--lag1", "0.8", "--quantum", "0.005", "--seed", "4")
+    again = columns(*SHS, *gauge)
     assert again["measured"].tolist() == run.observed.tolist() and np.array_equal(again["u"], clean)
 
 
@@ -322,9 +310,8 @@ def test_sidecars_and_figures(empty_folder: Path) -> None:
     ]  # fmt: skip
     side = json.loads((empty_folder / "made" / "experiment.toml.provenance.json").read_text())
     assert side["seed"] == 3 and side["parameters"]["A"]["value"] == 0.0126
-    assert "slip v" in (empty_folder / "t.svg").read_text() or "<svg" in (empty_folder / "t.svg").read_text()
+    assert "<svg" in (empty_folder / "t.svg").read_text()
     simulate("made", "--out", "u.json", "--no-provenance")
-    assert "made/experiment.toml" not in os.listdir()  # noqa: PTH208
     assert not (empty_folder / "u.json.provenance.json").exists()
 
 
@@ -463,10 +450,23 @@ def pressed_during_a_long_integration() -> Iterator[None]:
         (["--out-dir", "no/where"], "does not exist", "mkdir"),
         (["--out-dir", "m", "--loading", "inclined"], "inclined", "--loading"),
         (["--load-rise", "0", "--load", "1:5,1:6"], "positive time", "20 ms"),
+        (["--field", "-1e-4"], "a field of -0.0001 is not a size", "0 or more"),
+        (["--field", "much"], "is not a number", "--field"),
+        (["--field", "1 um"], "measures", "plain number"),
+        (["--field", "0.17"], "more than half of mu0 = 0.33", "such as 3e-4"),
+        (["--field", "0.11", "--set", "mu0=0.2"], "more than half of mu0 = 0.2", "standard deviation"),
+        (["--field-length", "5"], "without a field", "--field 3e-4"),
+        (["--field", "0", "--field-length", "-5"], "length of -5 um", "0.08 um or more"),
+        (["--field", "1e-4", "--field-length", "0"], "length of 0 um", "0.08 um or more"),
+        (["--field", "1e-4", "--field-length", "0.05"], "finer than knots 0.01 um apart", "0.08 um or more"),
+        (["--field", "1e-4", "--field-length", "5 s"], "measures", "um"),
+        (["--field", "1e-4", "--loading", "inclined"], "loaded from above", "--loading inclined"),
+        (["--field", "1e-4", "--field-length", "0.08", "--drive", "1e4:10", "--rate", "10"], "more than", "longer field length"),
     ],
 )  # fmt: skip
 def test_errors_say_what_and_what_instead(arguments: list[str], message: str, hint: str, empty_folder: Path) -> None:
     lines = simulate(*arguments, code=2).stderr.splitlines()
+    assert len(lines) == 2
     assert lines[0].startswith("Error: ") and message in lines[0]
     assert lines[1].startswith("Try: ") and hint in lines[1]
     assert not list(empty_folder.iterdir())
@@ -481,6 +481,8 @@ def test_errors_say_what_and_what_instead(arguments: list[str], message: str, hi
         (["--set", "W0=3"], "W0 is what the runs impose"),
         (["--set", "Vast=3"], "unknown parameter 'Vast'"),
         (["--loading", "inclined"], "loaded from above"),
+        (["--field", "0.2"], "more than half of mu0 = 0.33"),
+        (["--field-length", "5"], "without a field"),
     ],
 )
 def test_errors_about_an_experiment(arguments: list[str], message: str) -> None:

@@ -1,9 +1,7 @@
-"""`srf simulate --field`: the random function itself, the motion over it, what is written, what is refused."""
+"""`srf simulate --field`: the random function itself, the motion over it, what is written."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import re
@@ -13,37 +11,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline, PPoly
+from test_simulate_command import columns, read, simulate
 
-from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiled, compiler
 from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError
-from srfcli.data.experiment import read_experiment
 from srfcli.data.noise import FINEST_KNOTS, KNOTS, WIDEST_KNOTS, FrictionField
-from srfcli.data.values import Experiment
 from srfcli.laws.registry import load_registry
 from srfcli.validation.slider import Physics, Plan, Track, move
 
 STEADY = ("--V", "10", "--W0", "5", "--for", "2", "--rate", "100")
-
-
-def simulate(*arguments: str, code: int = 0) -> Result:
-    done = CliRunner().invoke(cli, ["simulate", *arguments], prog_name="srf")
-    assert done.exit_code == code, done.stderr
-    return done
-
-
-def columns(*arguments: str) -> dict[str, Any]:
-    rows = list(csv.DictReader(io.StringIO(simulate(*arguments, "--csv").stdout)))
-    return {name: np.array([float(r[name]) if r[name] else np.nan for r in rows]) for name in rows[0] if name != "run"}
-
-
-def read(folder: str) -> Experiment:
-    return read_experiment(Path(folder), registry=load_registry())
 
 
 def matern(d: Any, length: float) -> Any:
@@ -286,40 +266,3 @@ def test_an_experiment_with_effects_is_simulated_as_it_is_fitted(
     expected = predict(model, experiment, run, {name: float(value)}, rtol=1e-8).y
     found = columns("case", "--run", "strong", "--set", change, *(("--quantum", "1e-9") if column == "measured" else ()))
     assert found[column] == pytest.approx(expected, abs=2e-5)
-
-
-# ---- what is refused
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message", "hint"),
-    [
-        (["--field", "-1e-4"], "a field of -0.0001 is not a size", "0 or more"),
-        (["--field", "much"], "is not a number", "--field"),
-        (["--field", "1 um"], "measures", "plain number"),
-        (["--field", "0.17"], "more than half of mu0 = 0.33", "such as 3e-4"),
-        (["--field", "0.11", "--set", "mu0=0.2"], "more than half of mu0 = 0.2", "standard deviation"),
-        (["--field-length", "5"], "without a field", "--field 3e-4"),
-        (["--field", "0", "--field-length", "-5"], "length of -5 um", "0.08 um or more"),
-        (["--field", "1e-4", "--field-length", "0"], "length of 0 um", "0.08 um or more"),
-        (["--field", "1e-4", "--field-length", "0.05"], "finer than knots 0.01 um apart", "0.08 um or more"),
-        (["--field", "1e-4", "--field-length", "5 s"], "measures", "um"),
-        (["--field", "1e-4", "--loading", "inclined"], "loaded from above", "--loading inclined"),
-        (["--field", "1e-4", "--field-length", "0.08", "--drive", "1e4:10"], "more than", "longer field length"),
-    ],
-)  # fmt: skip
-def test_errors_say_what_and_what_instead(arguments: list[str], message: str, hint: str, empty_folder: Path) -> None:
-    lines = simulate(*arguments, "--rate", "10", code=2).stderr.splitlines()
-    assert len(lines) == 2
-    assert lines[0].startswith("Error: ") and message in lines[0]
-    assert lines[1].startswith("Try: ") and hint in lines[1]
-    assert not list(empty_folder.iterdir())
-
-
-def test_errors_about_an_experiment(empty_folder: Path) -> None:
-    simulate(*STEADY, "--out-dir", "made")
-    for arguments, message in (
-        (["--field", "0.2"], "more than half of mu0 = 0.33"),
-        (["--field-length", "5"], "without a field"),
-    ):
-        assert message in simulate("made", *arguments, code=2).stderr

@@ -358,6 +358,9 @@ APPARATUS_OPTIONS: Options = {
         for n, about in APPARATUS_FLAGS.items()
     },
 }
+plugins_option = click.option(
+    "--plugins", multiple=True, metavar="DIR", type=PATH, help="Folder with law files of your own; repeatable. Also SRF_PLUGINS."
+)
 SYSTEM_OPTIONS: Options = {
     "law": click.option("--law", metavar="NAME", help=_about("law"), shell_complete=names_of("friction")),
     "ageing": click.option("--ageing", metavar="NAME", help=_about("ageing"), shell_complete=names_of("ageing")),
@@ -371,13 +374,7 @@ SYSTEM_OPTIONS: Options = {
         metavar="NAME=VALUE",
         help="Set any parameter, with or without unit: --set Vsat=300 --set 'D0=0.5 um'.",
     ),
-    "plugins": click.option(
-        "--plugins",
-        multiple=True,
-        metavar="DIR",
-        type=click.Path(exists=True, path_type=Path),
-        help="Folder with law files of your own; repeatable. Also SRF_PLUGINS.",
-    ),
+    "plugins": plugins_option,
 }
 
 
@@ -433,11 +430,6 @@ def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str
             raise SrfError(f"{name} is set twice: {flags[name]} and {value}", "Give each parameter one value.")
         flags[name] = value
     return flags
-
-
-plugins_option = click.option(
-    "--plugins", multiple=True, metavar="DIR", type=PATH, help="Folder with law files of your own; repeatable. Also SRF_PLUGINS."
-)
 
 
 def value_option(name: str, help: str) -> Callable[[F], F]:

@@ -461,33 +461,11 @@ LOAD_STEP, LOAD_STEP_SHARE = 0.01, 0.8  # of the load; of what it changes by wit
 LATE = 10.0  # times the noise of what is observed, from where it is told that a step of the drive may have been between samples
 BOTH_WAYS = 0.1  # share of readings of either sign, from where a run slides to and fro
 LEAST_FRICTION, LARGEST_FRICTION = 0.01, 3.0  # that surfaces which slide in contact have
-NOTICE_KINDS = {  # of notices, as --fail-on takes them
-    "gap": "samples are missing",
-    "sampling-change": "the sampling rate changes",
-    "nan": "empty cells or NaN",
-    "repeated-time": "two samples at one time",
-    "backward-time": "time stamps that go back",
-    "spike": "single samples that stand out",
-    "reset": "a transducer was set anew",
-    "saturation": "samples at the end of the gauge's range",
-    "constant": "an observable that never changes",
-    "quantisation": "steps of the gauge that are not small against its noise",
-    "load-constant": "a load that varies no more than its noise",
-    "load-smoothed": "a load that was smoothed",
-    "load-steps": "a step of the load between two samples, whose course would show",
-    "modulation-differs": "the load is not modulated as declared",
-    "drive-differs": "the column of velocities is not the declared drive",
-    "drive-segmented": "a drive found in noisy velocities",
-    "drive-fitted": "a drive found in displacements",
-    "drive-steps": "a step of the drive that may have been between two samples, and would show",
-    "drive-smoothed": "a drive found in displacements by a smooth curve",
-    "friction": "a friction coefficient that no surfaces have",
-    "unit": "a heading and [columns] differ in unit",
-    "observable": "more than one observable in the file",
-    "load": "more than one load in the file",
-    "start-value": "a start value that is not the apparatus'",
-    "sigma": "critical loads without an error of their own",
-}
+NOTICE_KINDS = (  # as --fail-on takes them; docs/recordings.md says of each what it is
+    "gap", "sampling-change", "nan", "repeated-time", "backward-time", "spike", "reset", "saturation", "constant", "quantisation",
+    "load-constant", "load-smoothed", "load-steps", "modulation-differs", "drive-differs", "drive-segmented", "drive-fitted",
+    "drive-steps", "drive-smoothed", "friction", "unit", "observable", "load", "start-value", "sigma",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.data.values import CriticalLoads, Run, per_elongation
+from srfcli.data.values import CriticalLoads, Run
 from srfcli.diagnosis.design import DiscriminatingRun, described
 from srfcli.diagnosis.discrepancy import unexplained_friction
 from srfcli.diagnosis.residual_scan import Location, Row
 from srfcli.diagnosis.verdict import Diagnosis, parameters_of
-from srfcli.inference.prediction import of_run
-from srfcli.inference.recordings import slip_from
 from srfcli.inference.state_space import Filtered
 
 SCHEMA = "srf.diagnose/1"
@@ -26,7 +24,7 @@ class RunView:
     """One run under both models: what each expects of a reading (n,), given those before it, in the observable's unit.
 
     `white` are the innovations over their standard deviations (n,), by baseline and by the final model, `rms` their root mean
-    squares; `noise` is that standard deviation under the final model, its median; `slip` (n,) is the place in um.
+    squares.
     """
 
     run: Run
@@ -34,8 +32,6 @@ class RunView:
     baseline: Array
     augmented: Array
     rms: tuple[float, float]
-    noise: float
-    slip: Array
     white: tuple[Array, Array] = field(repr=False)
     others: tuple[tuple[Array, Array], ...] = field(repr=False, default=())
 
@@ -58,12 +54,8 @@ def _view(before: Filtered, after: Filtered, holdout: bool) -> RunView:
     y = [run.observed - f.found.nu for f in sides]
     white = [f.found.nu / np.sqrt(f.found.S) for f in sides]
     rms = [float(np.sqrt(np.mean(w[run.used] ** 2))) for w in white]
-    noise = float(np.median(np.sqrt(after.found.S[run.used])))
     others = tuple((s.observed - before.of(i).nu, s.observed - after.of(i).nu) for i, s in enumerate(run.others, 1))
-    slip = slip_from(run, y[1] / per_elongation(run.observable, run.stiffness, run.load(run.t)[0]))
-    return RunView(
-        replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), noise, slip, (white[0], white[1]), others
-    )  # fmt: skip
+    return RunView(replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), (white[0], white[1]), others)
 
 
 def answer(
@@ -171,9 +163,9 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
     for v in run_views(diagnosis):
         runs.append({
             "name": v.run.name, "holdout": v.holdout, "t": v.run.t, "observed": v.run.observed, "used": v.run.used,
-            "baseline": v.baseline, "augmented": v.augmented, "noise_level": v.noise, "V": v.run.drive(v.run.t),
-            "W": v.run.load(v.run.t)[0], "slip": v.slip, "windows": windows.get(v.run.name, []),
-            "observable": v.run.observable, "rms": list(v.rms), "modulation": of_run(v.run), "white": list(v.white),
+            "baseline": v.baseline, "augmented": v.augmented, "V": v.run.drive(v.run.t),
+            "W": v.run.load(v.run.t)[0], "windows": windows.get(v.run.name, []),
+            "rms": list(v.rms), "white": list(v.white),
             "friction": [None if v.run.holdout else found[v.run.name].force if v.run.name in found else np.zeros(v.run.t.size)
                          for found in friction],  # what a model leaves to its field
         })  # fmt: skip

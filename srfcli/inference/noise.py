@@ -88,9 +88,9 @@ def log_determinant(noise: Noise, parts: list[tuple[int, int]]) -> float:
     return float(total)
 
 
-def estimate_noise(residual: Array, parts: list[tuple[int, int]], *, orders: int = ORDERS) -> Noise:
+def estimate_noise(residual: Array, parts: list[tuple[int, int]]) -> Noise:
     """Return the autoregressive noise of `residual` (n,), by Burg's method; its order by the Bayesian information criterion."""
-    long = [residual[a:b] for a, b in parts if b - a > 4 * orders]
+    long = [residual[a:b] for a, b in parts if b - a > 4 * ORDERS]
     n = sum(piece.size for piece in long)
     values = np.concatenate([residual[a:b] for a, b in parts]) if parts else residual
     level = float(np.sqrt(np.mean(values**2)))
@@ -99,7 +99,7 @@ def estimate_noise(residual: Array, parts: list[tuple[int, int]], *, orders: int
     forward, backward = [p.copy() for p in long], [p.copy() for p in long]
     variance, phi = float(np.mean(np.concatenate(long) ** 2)), np.zeros(0)
     best = (n * np.log(variance), phi, variance)
-    for order in range(1, orders + 1):
+    for order in range(1, ORDERS + 1):
         above = sum(float(f[1:] @ b[:-1]) for f, b in zip(forward, backward, strict=True))
         below = sum(float(f[1:] @ f[1:] + b[:-1] @ b[:-1]) for f, b in zip(forward, backward, strict=True))
         k = 2 * above / below if below else 0.0
@@ -113,17 +113,17 @@ def estimate_noise(residual: Array, parts: list[tuple[int, int]], *, orders: int
     return Noise(sqrt(best[2]), tuple(best[1].tolist()), level)
 
 
-def difference_level(values: Array, parts: list[tuple[int, int]], *, order: int = 3) -> float:
-    """Return the standard deviation of white noise under a smooth signal, from its differences of this order.
+def difference_level(values: Array, parts: list[tuple[int, int]]) -> float:
+    """Return the standard deviation of white noise under a smooth signal, from its third differences.
 
     White noise alone is measured: coloured noise is smooth at the sampling interval and counts in part as signal.
     """
     total, count = 0.0, 0
     for a, b in parts:
-        if b - a > order + 1:
-            d = np.diff(values[a:b], n=order)
+        if b - a > 4:
+            d = np.diff(values[a:b], n=3)
             total, count = total + float(d @ d), count + d.size
-    return sqrt(total / count / comb(2 * order, order)) if count else 0.0
+    return sqrt(total / count / comb(6, 3)) if count else 0.0
 
 
 def lag_one(values: Array, parts: list[tuple[int, int]]) -> float:

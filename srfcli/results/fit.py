@@ -471,18 +471,21 @@ def said_likelier(intervals: Sequence[Interval], shown: Callable[[str, float], t
     return [f"{where}. The fit has not ended at the highest maximum, and intervals are about its own: begin at these values"]
 
 
+def chi2_notes(of: str, cost: float, freedom: int) -> list[str]:
+    """Return a note where a chi2 of critical loads is larger than chance has it."""
+    if (chance := chance_of(cost, freedom)) >= IMPROBABLE:
+        return []
+    said = f"{of}: chi2 {cost:.4g} on {freedom} degrees of freedom, chance {chance:.1g}"
+    return [f"{said}; the model does not describe the loads within sigma, and the errors do not allow for that"]
+
+
 def load_notes(fit: Fit) -> list[str]:
     """Return what a reader of a fit has to know of its critical loads: whether they are described, and how they were matched."""
     notes, fitted = [], [t for t in fit.tables if not t.loads.holdout]
     alone = not any(not r.holdout for r in fit.runs)
     size, cost = sum(t.white.size for t in fitted), sum(t.match.cost for t in fitted)
     freedom = size - len(fit.names) if alone else size  # beside recordings they have little say in the parameters
-    chance = chance_of(cost, freedom)
-    if fit.status.ok and chance < IMPROBABLE:
-        notes.append(
-            f"critical loads: chi2 {cost:.4g} on {freedom} degrees of freedom, chance {chance:.1g}; the model does not describe"
-            " them within sigma, and the errors do not allow for that"
-        )
+    notes += chi2_notes("critical loads", cost, freedom) if fit.status.ok else []
     for t in fit.tables:
         notes += [f"{t.loads.name}: {text}" for text in (*t.loads.table.notes, *match_notes(t.loads.table, t.match))]
     return notes
@@ -623,12 +626,7 @@ class ThresholdFitResult(Result):
         for m in self.found.methods:
             if m.uncertainty.weakest:
                 notes.append(f"{m.method}: least determined is {m.uncertainty.weakest}")
-            chance = chance_of(m.cost, self._freedom)
-            if m.status.ok and chance < IMPROBABLE:
-                notes.append(
-                    f"{m.method}: chi2 {m.cost:.4g} on {self._freedom} degrees of freedom: chance {chance:.1g}; the model does"
-                    " not describe the data within sigma, and the errors do not allow for that"
-                )
+            notes += chi2_notes(m.method, m.cost, self._freedom) if m.status.ok else []
             notes += [f"{m.method}: {note}" for note in m.notes]
         return notes + self._beyond_errors()
 

@@ -293,14 +293,7 @@ def column_name(axis: MapAxis) -> str:
 # Figures of stability maps: growth as colour, boundaries as lines, special points as marks.
 
 SHADES = "PuOr_r"  # purple and orange: told apart in all common forms of colour blindness, and in grey by the curves
-MARKS = {
-    "fold": ("^", "fold"),
-    "cusp": ("*", "cusp"),
-    "1:1": ("o", "1:1"),
-    "1:2": ("D", "1:2"),
-    "1:3": ("v", "1:3"),
-    "1:4": ("s", "1:4"),
-}
+MARKS = {"fold": "^", "cusp": "*", "1:1": "o", "1:2": "D", "1:3": "v", "1:4": "s"}
 HATCH = "#5A4A7A"
 LOOKS: dict[str, dict[str, Any]] = {
     "": {"label": "boundary", "color": "black", "linewidth": 1.6},
@@ -366,7 +359,7 @@ def _draw_marks(ax: Axes, found: MapResult) -> None:
     for point in (s for points in found.special for s in points if s.status.ok):
         places.setdefault(str(point.what), []).append(found._coordinates(point.p))
     for what, mine in places.items():
-        marker, label = MARKS.get(what, CRITICALITY_MARK)
+        marker, label = (MARKS[what], what) if what in MARKS else CRITICALITY_MARK
         ax.plot(
             *zip(*mine, strict=True), linestyle="none", marker=marker, markersize=6.5 if marker == "P" else 5.5, label=label,
             markerfacecolor="none",  # one mark does not hide another

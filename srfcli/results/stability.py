@@ -315,12 +315,8 @@ class ResponseResult(Result):
         if "unstable" in steady:
             notes.append("where steady sliding is unstable the response is not what would be seen")
         kept = self.system.described(without=(self.name, "eps"))
-        return Table("srf.response/2", tuple(columns), rows, self.system.model.title, tuple(notes), kept)
-
-    @property
-    def status(self) -> Status:
-        """Return the worst status of the rows."""
-        return worst(self.response.status)
+        overall = worst(status).value
+        return Table("srf.response/2", tuple(columns), rows, self.system.model.title, tuple(notes), kept, status=overall)
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return gain and phase of each quantity over the parameter that was swept."""
@@ -373,12 +369,8 @@ class MeanFrictionResult(Result):
         )
         notes = ("mean over a forcing period of the forced periodic state, stable or not",)
         kept = self.system.described(without=(self.name, "eps"))
-        return Table("srf.response.mean/2", columns, rows, self.system.model.title, notes, kept)
-
-    @property
-    def status(self) -> Status:
-        """Return the worst status of the rows."""
-        return worst([s for found in self.means.values() for s in found.status])
+        overall = worst([s for found in self.means.values() for s in found.status]).value
+        return Table("srf.response.mean/2", columns, rows, self.system.model.title, notes, kept, status=overall)
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the drop of the mean friction force over the parameter that was swept, a curve for each amplitude."""

@@ -230,15 +230,13 @@ def _evidence(fitted: Fitted) -> Mapping[str, float]:
 
 
 def _errors(view: RunView) -> Mapping[str, float | None]:
-    """Return a held-out run's rms in um, and over the noise, under baseline and final model."""
+    """Return a held-out run's rms in um under baseline and final model."""
     run = view.run
 
     def rms(predicted: np.ndarray) -> float | None:
         return _finite(float(np.sqrt(np.mean((run.observed - predicted)[run.used] ** 2))))
 
-    before, after = view.rms
-    sizes = {"baseline": rms(view.baseline), "augmented": rms(view.augmented)}
-    return {**sizes, "baseline_over_noise": _finite(before), "augmented_over_noise": _finite(after)}
+    return {"baseline": rms(view.baseline), "augmented": rms(view.augmented)}
 
 
 def _finite(value: Any) -> Any:

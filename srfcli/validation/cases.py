@@ -320,7 +320,7 @@ def _set(
     shares = np.array([s.share for s in found])
     setting = found[int(rng.choice(len(found), p=shares / shares.sum()))]
     sizes = SIZES.get(setting.apparatus, {})
-    own = [sizes.get(e.varies, (e.weak, e.strong, e.beside)) for e in forms]
+    own = [sizes.get(e.varies) or (e.weak, e.strong, e.beside) for e in forms]
     return tuple(replace(e, weak=a, strong=b, beside=c) for e, (a, b, c) in zip(forms, own, strict=True)), setting
 
 
@@ -508,14 +508,12 @@ def make_case(
     plans: tuple[Plan, ...] | None = None,
     setting: Setting | None = None,
     noise: str | None = None,
-    strengths: bool = True,
     bank: str = "paper",
 ) -> Truth:
     """Write a concealed experiment to the new folder `folder` and return the truth about it, ready for JSON.
 
     `kind` is none, single, pair or outside, in the wide `bank` also ageing or one-run; `effects` names them; the rest is as in
-    `Asked`. With `strengths` every run is moved again without each effect, to know how far it moves the record. The same seed and
-    choices give the same bytes.
+    `Asked`. The same seed and choices give the same bytes.
     Raises SrfError for unknown names, and where the folder exists.
     """
     if folder.exists():
@@ -530,8 +528,6 @@ def make_case(
         for plan, u in motions.items()
     }
     truth = _truth(recipe, attempt, seed)
-    if strengths:
-        truth["strength"] = {e.name: strength_of(e, recipe, motions) for e in recipe.effects}
     folder.mkdir(parents=True)
     files = case_files(rig.title, recipe.baseline, readings, rig=rig, spikes=recipe.gauge.spikes > 0)
     for name, text in files.items():
@@ -571,26 +567,6 @@ def shown(p: Physics, plan: Plan) -> Array:
 def unread(rig: Rig, p: Physics, plan: Plan) -> Array:
     """Return what a rig would record (n,) without noise; NaN from where the slider cannot be followed."""
     return recorded(rig, p, plan, shown(p, plan))
-
-
-def strength_of(effect: Effect, recipe: Recipe, motions: Mapping[Plan, Array]) -> Truth:
-    """Return how far one effect moves the record: rms over noise by run, and over all samples of the fitted runs.
-
-    `noncentrality` is the sum of squares over the noise's variance, before a fit of the baseline has absorbed its share; null
-    where the slider without the effect cannot be followed.
-    """
-    rig = RIGS[recipe.rig]
-    rms: dict[str, float | None] = {}
-    total: float | None = 0.0
-    for plan, u in motions.items():
-        p = recipe.acting(plan)
-        less = effect.removed(p)
-        change = (recorded(rig, p, plan, u) - unread(rig, less, plan)) / recipe.gauge.louder(plan.loud).sigma
-        followed = bool(np.isfinite(change).all())
-        rms[plan.name] = round(float(np.sqrt(np.mean(change**2))), 6) if followed else None
-        if not plan.holdout:
-            total = total + float(change @ change) if followed and total is not None else None
-    return {"rms_over_noise": rms, "noncentrality": None if total is None else round(total, 4)}
 
 
 def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
@@ -768,7 +744,6 @@ def make_bank(
     *,
     apart: Path | None = None,
     workers: int = 1,
-    strengths: bool = True,
     kinds: Sequence[str] | None = None,
     track: str | None = None,
     bank: str = "paper",
@@ -790,7 +765,7 @@ def make_bank(
     plan = plan_bank(n, seed, bank=bank, kinds=kinds)
     folder.mkdir(parents=True)
     rough, own = TRACKS[track] if track else (None, None)
-    shared: dict[str, Any] = {"rough": rough, "own": own, "strengths": strengths, "bank": bank}
+    shared: dict[str, Any] = {"rough": rough, "own": own, "bank": bank}
     tasks = [
         {"folder": folder / f"case-{i:03d}", "seed": (seed, i), "kind": kind, "effects": names, **shared}
         for i, (kind, names) in enumerate(plan)

@@ -130,7 +130,7 @@ def _make(trial: Trial, asked: dict[str, Any], *, workers: int, told: Callable[[
     trial.apart.unlink(missing_ok=True)
     with _interruptible():
         drawn = {"kinds": asked["kinds"] or None, "track": asked["track"], "bank": asked["bank"]}
-        make_bank(part, asked["cases"], asked["seed"], **drawn, apart=trial.apart, workers=workers, told=told, strengths=False)
+        make_bank(part, asked["cases"], asked["seed"], **drawn, apart=trial.apart, workers=workers, told=told)
     part.rename(trial.bank)
 
 
