@@ -101,7 +101,7 @@ def main() -> None:
             print(f"  {row[0]:24s} log evidence {row[1]:+8.1f}  rms {row[2]:.3f}  {row[5]}")
         for row in found.parameter_table.rows:
             told = [f"{v:.4g} +- {e:.2g}" if v is not None else "-" for v, e in ((row[1], row[2]), (row[3], row[4]))]
-            print(f"  {row[0]:8s} baseline {told[0]:22s} final model {told[1]:22s} {row[5]}")
+            print(f"  {row[0]:8s} baseline {told[0]:22s} augmented model {told[1]:22s} {row[5]}")
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ def test_the_tables_fit_a_page(small: Path) -> None:
     tables = [line for line in text.splitlines() if not line.startswith("Note: ")]
     assert max(map(len, tables)) <= 100
     assert tables[:2] == ["three steps", "srf-vsat, dieterich, elastic, inertia on; stiffness 0.21 N/um, mass 2.37 kg"]
-    for title in ("Samples", "Readings", "Noise", "Imposed", "What the load can tell at best: errors, and"):
+    for title in ("Samples", "Readings", "Noise", "Imposed", "Smallest errors that the load allows"):
         assert any(line.startswith(title) for line in tables)
     assert next(line.split() for line in tables if line.startswith("one "))[:5] == ["one", "fit", "120", "120", "1.19"]
 

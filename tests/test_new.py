@@ -119,7 +119,7 @@ def test_a_drive_that_never_moves_is_a_hold(step: dict[str, np.ndarray]) -> None
     table(["time [s]", "V [um/s]", "normal_load [N]", "force [N]"], [step["t"], 0 * step["V"], step["sigma"], step["mu"] * 20])
     done = srf("new", "run1.csv", "--stiffness", "40 N/mm")
     assert "kind of experiment: shs, as the drive of run1 does not move" in done.stderr
-    assert "What the load can tell" in srf("check", ".").stdout
+    assert "Smallest errors that the load allows" in srf("check", ".").stdout
 
 
 @pytest.mark.parametrize(
@@ -407,7 +407,7 @@ def test_bounds_of_the_slip_length_are_the_recording_s(V: float, law: str) -> No
         (["run1.csv", "--stiffness", "1 1/um", "--window", "900,999"], "no sample of", "file's own clock"),
         (["run1.csv", "--stiffness", "1 1/um", "--law", "dietrich-ruina"], "dietrich-ruina", "Did you mean 'dieterich-ruina'?"),
         (["run1.csv", "--stiffness", "1 1/um", "--holdout", "run7"], "no such run", "Did you mean 'run1'?"),
-        (["still.csv", "--stiffness", "1 1/um"], "which column is the load point's velocity", "--drive VELOCITY"),
+        (["still.csv", "--stiffness", "1 1/um"], "which column is the load point's velocity", "--drive '60:3, 60:10'"),
         (["still.csv", "--stiffness", "1 1/um"], "velocity or displacement? It has", "--column load_point_displacement=HEADING"),
         (["dated.csv", "--stiffness", "1 1/um", "--drive", "1"], "'01/02/2024 00:00:01'", "the seconds since the start"),
         (["twice.csv", "--stiffness", "1 1/um", "--drive", "1", "--load", "5 N"], "2 columns are called", "rename one"),

@@ -207,7 +207,7 @@ def test_a_folder_reads_back_and_says_what_made_it(empty_folder: Path) -> None:
     arguments = (*STEADY, "--field", "3e-4", "--seed", "4")
     c = columns(*arguments)
     done = simulate(*arguments, "--out-dir", "made", "--out", "t.json")
-    assert "Note: track: mu0 wanders by 0.0003 (standard deviation) over 10 um" in done.stderr
+    assert "Note: track: mu0 varies by 0.0003 (standard deviation) over 10 um" in done.stderr
     run, e = read("made").runs[0], read("made")
     assert np.array_equal(run.observed, c["u"]) and not run.notices
     assert {p.name for p in e.parameters} == {"mu0", "A", "B", "D0", "V0", "Vsat", "lambda"}

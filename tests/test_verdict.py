@@ -46,7 +46,7 @@ DRAG = model("viscous-drag", evidence=100.0)
 def test_a_model_that_passes_is_taken_where_one_that_does_not_is_hardly_ahead_of_it(evidence, said):
     found = concluded(model("slip-evolution", evidence=100.0, passes=False), model("viscous-drag", evidence=evidence), LOST)
     assert (found.verdict, found.effects) == said
-    best = "viscous-drag: nothing is left that a test finds" if said[1] else "slip-evolution: a stretch of steps is off"
+    best = "viscous-drag passes every test" if said[1] else "slip-evolution: a stretch of steps is off"
     assert found.reasons[0] == best
     assert (found.confidence["viscous-drag"] > 0.9) is bool(said[1])
 
@@ -81,7 +81,7 @@ def test_models_that_do_equally_well_are_all_named():
 def test_nothing_is_missing_only_where_it_could_have_been_seen(sizes, verdict):
     scores = [score(n, size) for n, size in zip(("viscous-drag", "linker-dieterich"), sizes, strict=True)]
     found = concluded(model(evidence=0.0), scores=scores)
-    assert found.verdict == verdict and not found.effects and found.reasons[0] == "none: nothing is left that a test finds"
+    assert found.verdict == verdict and not found.effects and found.reasons[0] == "the baseline passes every test"
     assert found.detectable == {"viscous-drag": sizes[0], "linker-dieterich": sizes[1]}
 
 

@@ -132,6 +132,8 @@ def _numbers(name: str, parts: Sequence[str], text: str) -> tuple[tuple[float, .
             pairs.append(split_quantity(part, name=name))
         except SrfError as error:
             raise SrfError(f"--over {text!r}: {part.strip()!r} is not a number", AXIS_FORM) from error
+        if pairs[-1][1][:1] in ("-", "+"):
+            raise SrfError(f"--over {text!r}: {part.strip()!r} is not a number", AXIS_FORM)
     units = sorted({unit for _, unit in pairs if unit})
     if len(units) > 1:
         hint = "Write the unit once, after the last number."
@@ -205,7 +207,7 @@ def values_option(
     """
     unit = "" if parameter.unit == "1" else f", in {parameter.unit}"
     meaning = about or parameter.about or parameter.name
-    otherwise = f"  {CONFIGURED}" if configured and default is None else ""
+    otherwise = f"  [default: {','.join(f'{x:g}' for x in default)}]" if default else f"  {CONFIGURED}" if configured else ""
     return click.option(
         f"--{parameter.name}",
         parameter.name,

@@ -351,10 +351,12 @@ def parse_pieces(text: str, unit: str, *, option: str, example: str) -> tuple[Pi
 
 def _parse_piece(part: str, number: int, unit: str, option: str, example: str) -> Piece:
     where = f"{option}: piece {number}, {part!r},"
-    duration_text, colon, values_text = part.partition(":")
+    duration_text, _, values_text = part.partition(":")
     ends = [end.strip() for end in values_text.split("->")]
-    if not colon or not duration_text.strip() or not all(ends) or len(ends) > 2:
-        raise SrfError(f"{where} is not DURATION:VALUE or DURATION:FROM->TO", f"Write {option} '{example}'.")
+    if part.count(":") != 1 or not duration_text.strip() or not all(ends) or len(ends) > 2:
+        raise SrfError(
+            f"{where} is not DURATION:VALUE or DURATION:FROM->TO", f"Write pieces with commas between them: {option} '{example}'."
+        )
     duration = parse_quantity(duration_text, "s", name=f"{option}: the duration of piece {number}")
     if not 0 < duration <= LONGEST_TIME:
         raise SrfError(f"{where} lasts {duration:g} s", f"Give each piece a duration above 0, up to {LONGEST_TIME:g} s.")

@@ -48,7 +48,9 @@ class Default:
 
 DEFAULTS = {
     "law": Default("srf-vsat", "friction law"),
-    "ageing": Default("dieterich", "evolution law of the state variable (ageing, slip, ...), with modifiers after a plus sign"),
+    "ageing": Default(
+        "dieterich", "evolution law: dieterich (the ageing law), ruina (the slip law), ...; modifiers after a plus sign"
+    ),
     "interface": Default("elastic", "shear stiffness of the interface, by name"),
     "loading": Default("vertical", "vertical: the load is imposed; inclined: it follows a spring at --angle"),
     "inertia": Default(True, "whether the slider's mass counts"),
@@ -109,7 +111,7 @@ def load_toml(path: Path | None) -> TomlSettings:
     except SrfError as error:
         raise SrfError(error.message, error.hint or 'A setting looks like K = "0.21 N/um" below [parameters].') from error
     except OSError as error:
-        raise SrfError(f"{path} cannot be read: {error.strerror}", exit_code=1) from error
+        raise SrfError(f"{path} cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1) from error
     _refuse_unknown(data, {"parameters", "defaults"}, f"table in {path}")
     tables = {name: data.get(name, {}) for name in ("parameters", "defaults")}
     for name, table in tables.items():

@@ -156,6 +156,8 @@ def unit_factor(written: str, unit: str, geometry: Geometry = NO_GEOMETRY, *, wh
             if geometry.thickness:  # a stress per strain is a stiffness
                 return ratio * (SQUARE_MILLIMETRE / geometry.thickness if found.powers[2] else geometry.thickness)
             hint = f'A strain needs the layer\'s thickness, from which {unit} follow: [apparatus] thickness = "4 mm"'
+            if found.powers[2]:
+                hint = f"A stiffness is a stress over a length, as in '30 MPa/mm'. {hint.replace('strain', 'stress per strain')}"
             kind = "unit"
     prefix = f"{where}: " if where else ""
     said = f"{prefix}{written!r} measures {describe(found.powers)}, not {describe(wanted.powers)}"

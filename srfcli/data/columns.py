@@ -300,8 +300,9 @@ def _needed(run: RunDescription, finder: Finder) -> list[Channel]:
         hint = f"One of them is needed; [columns] can name it. {_near(roles, names)}"
         lacks.append((f"{run.file}: none of the columns {', '.join(roles)}{found}", hint))
     seen = observables if run.observables else ([c for c in observables if c.role in finder.specs] or observables)[:1]
-    if len(observables) > len(seen) > 0:
-        others = ", ".join(c.role for c in observables if c is not seen[0])
+    beside = [c.role for c in observables if c.column not in {one.column for one in seen}]
+    if beside:
+        others = ", ".join(beside)
         every = ", ".join(f'"{c.role}"' for c in observables)
         what = f"{seen[0].role} is what is compared; the file also has {others}, left aside (observables = [{every}] takes all)"
         finder.notices.append(Notice("observable", str(run.file), what))
@@ -313,7 +314,7 @@ def _needed(run: RunDescription, finder: Finder) -> list[Channel]:
             what = f"{run.node.where}: the run has no drive, and {run.file} no load_point_velocity or load_point_displacement"
             lacks.append((what, hint))
     weights = [c for role in ("normal_load", "normal_stress") if (c := finder.find(role))]
-    if len(weights) > 1:
+    if len({c.column for c in weights}) > 1:
         what = "normal_load is what counts; the file also has normal_stress, left aside"
         finder.notices.append(Notice("load", str(run.file), what))
     if not weights and run.load is None and any(c.role != "friction" for c in seen):

@@ -41,6 +41,7 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
 READABLE = (*OBSERVABLES, "shear_stress", *OTHER_OBSERVABLES)  # what `observables` may list
 MOST_OBSERVABLES = 3  # of a run
 LARGEST_DESCRIPTION = 16 * 2**20  # bytes
+TOML_FORM = 'Text goes in quotes, law = "srf-vsat", a truth value is true or false, and each run begins with [[runs]].'
 CORRECTIONS = ("reset", "small-reset", "spike")  # of a run: what is proposed, and made only where it is asked for
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
 _RUN = (
@@ -174,7 +175,7 @@ def open_node(path: Path) -> Node:
                 f"For a recording, `srf new {path}` writes an experiment.toml. A table of critical loads goes under "
                 f"[[thresholds]] in an experiment.toml, or to `srf fit {path}`.",
             ) from None
-        raise SrfError(error.message, error.hint or 'Text goes in quotes: law = "srf-vsat".') from None
+        raise SrfError(error.message, error.hint or TOML_FORM) from None
     return Node(path, table, (), text)
 
 

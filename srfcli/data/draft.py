@@ -310,12 +310,23 @@ def missing(
         what = "friction, shear stress, force or elongation of the spring"
         lacks.append(("`columns` shear_stress=HEADING", f"{path}: which column is {what}? It has {listed}"))
     if not (driven or roles.intersection(DRIVES)):
-        option = "`drive` VELOCITY, or `columns` load_point_displacement=HEADING"
+        pieces = "`drive` '60:3, 60:10' (DURATION:VELOCITY in s and um/s, 0 is a hold)"
+        option = f"{pieces}, or `columns` load_point_displacement=HEADING"
         lacks.append((option, f"{path}: which column is the load point's velocity or displacement? It has {listed}"))
     if not (loaded or roles & {"normal_load", "normal_stress", "friction"}):
-        option = "`load` '5 N', or `columns` normal_stress=HEADING"
+        load, role = ("5 N", "normal_load") if roles & {"force"} else ("20 MPa", "normal_stress")
+        option = f"`load` '{load}', or `columns` {role}=HEADING"
         lacks.append((option, f"{path}: which column is the normal load or stress? It has {listed}"))
     return lacks
+
+
+def _unknown_units(headings: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield of each heading whose unit is none what is wrong with it, and a hint."""
+    for heading in headings:
+        try:
+            find_unit(_spelled(heading)[1] or "1")
+        except SrfError as error:
+            yield f"'{heading}': {error.message}", error.hint or ""
 
 
 def _check_rig(columns: Sequence[Named], wish: Wish, path: Path) -> None:
@@ -352,7 +363,9 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         own = name_columns(headings, wish.columns, path=path, per_load=per_load, geometry=geometry)
         lacks = missing(own, path, headings, driven=wish.drive is not None, loaded=wish.load is not None)
         if lacks:
-            raise SrfError(lacks[0][1], " ".join(f"Say it with {option}." for option, _ in lacks))
+            odd = list(_unknown_units(headings))
+            said, hints = [lacks[0][1], *(what for what, _ in odd)], [f"Say it with {option}." for option, _ in lacks]
+            raise SrfError("; ".join(said), " ".join([*(hint for _, hint in odd), *hints]))
         _check_rig(own, wish, path)
         if named and [(n.role, n.heading, n.unit) for n in own] != [(n.role, n.heading, n.unit) for n in named]:
             raise SrfError(f"{path}: its columns are not those of {files[0]}", "Files of one experiment have the same headings.")
@@ -371,6 +384,8 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     runs = list(read.runs)
     remarks += [*told_of_runs(runs, MISREAD), *filter(None, [read.rescaled()])]
     modulations = _modulations(runs)
+    if wish.kind == "shs" and all(np.abs(V := run.drive(run.t)).min() > HOLD_SPEED * np.abs(V).max() for run in runs):
+        raise SrfError("`kind` shs: no drive stops", "State the holds: `drive` '60:10, 100:0, 60:10', in s and um/s.")
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
     remarks.append(f"kind of experiment: {kind}, {why}")
     if still := [name for name in sketch.free if name not in sketch.strokes]:

@@ -285,6 +285,12 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
     stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
     rise = np.abs(drive(t)) * per_elongation(role, stiffness, at_start)
     recorded = {what: stress for what, stress in units.items() if what != STIFFNESS}
+    if len(set(recorded.values())) > 1:
+        named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in recorded.items())
+        raise SrfError(
+            f"{run.node.where}: {named}: friction is the ratio of two forces or of two stresses",
+            'Say the area of the contact, area = "25 cm^2" under [apparatus] or --area of `srf new`, or correct the unit.',
+        )
     if recorded and units.get(STIFFNESS) not in (None, *recorded.values()):
         raise SrfError(
             f"{run.node.where}: the stiffness is in {apparatus.stated}, and {', '.join(recorded)} "
@@ -292,9 +298,6 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
             'Say the area of the contact, area = "25 cm^2" under [apparatus] or --area of `srf new`, '
             f"or give the stiffness in {'MPa/mm' if any(recorded.values()) else 'N/um'}.",
         )
-    if len(set(units.values())) > 1:
-        named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())
-        notices.append(Notice("unit", run.file.name, f"{named}: a stress counts as the force on 1 mm^2"))
     observed, used, quantum, flaws, proposed = clean_observable(
         columns.place(role), columns.arrays[role], rise=rise, load=load, corrections=run.corrections
     )

@@ -66,7 +66,7 @@ def read_thresholds(path: Path) -> Thresholds:
     try:
         text = read_text(path, limit=LARGEST_TABLE, what="a table of critical loads")
     except OSError as error:
-        raise SrfError(f"{path} cannot be read: {error.strerror}", exit_code=1) from error
+        raise SrfError(f"{path} cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1) from error
     numbered = enumerate(text.splitlines(), start=1)
     lines = [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
     if not lines:

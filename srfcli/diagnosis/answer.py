@@ -23,7 +23,7 @@ SCHEMA = "srf.diagnose/1"
 class RunView:
     """One run under both models: what each expects of a reading (n,), given those before it, in the observable's unit.
 
-    `white` are the innovations over their standard deviations (n,), by baseline and by the final model, `rms` their root mean
+    `white` are the innovations over their standard deviations (n,), by baseline and by the augmented model, `rms` their root mean
     squares.
     """
 
@@ -42,7 +42,7 @@ class RunView:
 
 
 def run_views(diagnosis: Diagnosis) -> tuple[RunView, ...]:
-    """Return every run under baseline and final model, fitted ones first."""
+    """Return every run under baseline and augmented model, fitted ones first."""
     before, after = diagnosis.shown.fit.maximum.point.runs, diagnosis.best.fit.maximum.point.runs
     found = [_view(b, a, False) for b, a in zip(before, after, strict=True)]
     same = diagnosis.best is diagnosis.baseline
@@ -132,7 +132,7 @@ class LoadView:
 
 
 def load_views(diagnosis: Diagnosis) -> tuple[LoadView, ...]:
-    """Return every table of critical loads under baseline and final model, fitted ones first."""
+    """Return every table of critical loads under baseline and augmented model, fitted ones first."""
     fitted = zip(*(f.fit.maximum.point.tables for f in (diagnosis.shown, diagnosis.best)), strict=True)
     same = diagnosis.best is diagnosis.baseline
     held = ((h.baseline, h.baseline if same else h.augmented) for h in diagnosis.held_loads)
@@ -174,7 +174,7 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
          "chi2": list(v.chi2)}
         for v in load_views(diagnosis)
     ]  # fmt: skip
-    effects = [e for f in (*diagnosis.ranked, diagnosis.best) for e in f.hypothesis.effects]  # variants: the final model's
+    effects = [e for f in (*diagnosis.ranked, diagnosis.best) for e in f.hypothesis.effects]  # variants: the augmented model's
     return {
         "title": diagnosis.experiment.title,
         "about": {e.reported: e.about for e in effects},
@@ -214,7 +214,7 @@ def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def parameter_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return each parameter under both models, and the shift of the baseline's, in the final model's standard errors."""
+    """Return each parameter under both models, and the shift of the baseline's, in the augmented model's standard errors."""
     before, after = parameters_of(diagnosis.shown), parameters_of(diagnosis.best)
     rows = []
     for name in dict.fromkeys([*before, *after]):

@@ -177,7 +177,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     if search.on_request:
         names = ", ".join(search.on_request)
         remarks.append(
-            (f"not tried, as they are looked for where they are named alone: {names}; --effect NAME", (UNKNOWN, ALONE))
+            (f"not tried, as they are on request only: {names}; --effect NAME tries those named and no others", (UNKNOWN, ALONE))
         )
     if whole.runs and not baseline.fit.likelihood.problem.runs:
         remarks.append(("held-out runs are not judged, as no run was fitted that would tell the gauge's noise", ALWAYS))
@@ -380,7 +380,7 @@ def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[H
 def _said(best: Model, close: Sequence[Model], scores: Sequence[Score], cut_short: bool) -> tuple[str, list[str]]:
     if best.against:
         return "unknown", [f"{best.name}: {reason}" for reason in best.against]
-    reasons = [f"{best.name}: nothing is left that a test finds"]
+    reasons = [f"{best.name if best.hypothesis.reported else 'the baseline'} passes every test"]
     if not best.hypothesis.reported:
         if cut_short:
             return "inconclusive", [*reasons, "models that may explain more were not fitted"]

@@ -117,7 +117,8 @@ def free_parameters(
     """
     own = dict(bounds or {})
     if not names:
-        raise SrfError("no parameter is free", f"Name some in `free`, as A,B,D0; known: {', '.join(p.name for p in parameters)}")
+        known = ", ".join(p.name for p in parameters if p.name not in GIVEN)
+        raise SrfError("no parameter is free", f"Name some in `free`, as A,B,D0; known: {known}")
     for name in own:
         require_parameter(name, parameters, where=where)
         if name not in names:

@@ -37,7 +37,7 @@ class FittedField:
         if not self.amplitude:
             return "friction field: none is needed"
         whose = "one for all runs" if self.shared else "each run has its own"
-        return f"friction field: mu0 wanders by {self.amplitude:.2g} (standard deviation) over {self.length_um:.2g} um; {whose}"
+        return f"friction field: mu0 varies by {self.amplitude:.2g} (standard deviation) over {self.length_um:.2g} um; {whose}"
 
 
 @dataclass(frozen=True)

@@ -187,7 +187,6 @@ COLUMNS = (
     Column("lambda_peak", about="the same for a change of lambda by 10 %"),
     Column("n_peak", about="the same for a change of n by 0.1"),
 )
-CHANGE_HEADINGS = {"alpha": "0.2 makes", "lambda": "10 % makes", "n": "0.1 makes"}
 
 
 def row(check: RunCheck, told: CramerRaoBound | None) -> tuple[Any, ...]:
@@ -207,7 +206,7 @@ def row(check: RunCheck, told: CramerRaoBound | None) -> tuple[Any, ...]:
         "W_mean": mean, "W_min": lowest, "W_max": highest, "W_rate": load.rate,
         "f": found.frequency if found else None, "eps": found.amplitude if found else None,
         "onset": found.onset if found and math.isfinite(found.onset) else None,
-        **{f"{name}_{key}": found_out.get(key, {}).get(name) for name in CHANGE_HEADINGS for key in ("error", "peak")},
+        **{f"{name}_{key}": found_out.get(key, {}).get(name) for name in CHANGES for key in ("error", "peak")},
     }  # fmt: skip
     return tuple(cells[column.name] for column in COLUMNS)
 
@@ -265,11 +264,11 @@ def rounded(value: Any, digits: int) -> Any:
 
 
 def _told(forecast: Forecast) -> Table:
-    known = [name for name in CHANGE_HEADINGS if any(name in r.errors for r in forecast.runs)]
+    known = [name for name in CHANGES if any(name in r.errors for r in forecast.runs)]
     told = [*forecast.runs, *([forecast.together] if forecast.together else [])]
     cells = [[r.name, _percent(math.expm1(r.variation)), *(c for name in known for c in _errors(r, name))] for r in told]
-    headings = [heading for name in known for heading in (f"{name} error", CHANGE_HEADINGS[name])]
-    title = "What the load can tell at best: errors, and what a change makes, over the noise of a sample"
+    headings = [heading for name in known for heading in (f"{name} error", CHANGES[name])]
+    title = "Smallest errors that the load allows, and the effect of a change, over the noise of a sample"
     return _text_table(["run", "load varies", *headings], cells, title)
 
 
@@ -329,15 +328,15 @@ LIMITS = {"alpha": (0.05, 0.5), "lambda": (0.1, 1.0), "n": (0.1, 1.0)}
 # peaks over the noise of a sample, below which a parameter can hardly, and cannot, be identified
 SEEN, HIDDEN = 3.0, 0.3
 CAN = "can be identified"
-CHANGES = {"alpha": "alpha = 0.2", "lambda": "a change by 10 %", "n": "a change by 0.1"}
+CHANGES = {"alpha": "alpha + 0.2", "lambda": "lambda + 10 %", "n": "n + 0.1"}
 SUBJECTS = {
     "alpha": "alpha (Linker-Dieterich: a change of load changes the age)",
     "lambda": "lambda (the interface's elastic length)",
     "n": "n (the exponent with which the interface stiffens under load)",
 }
 NOISE = (
-    "noise: about parabolas over 64 to 256 samples (and a modulation's harmonics), where these are calm; shares are those of its "
-    "variance; a fit estimates the same parts with its parameters"
+    "noise: what is left of stretches of 64 to 256 samples after a parabola (and a modulation's harmonics) is subtracted; "
+    "stretches with transients are left out; shares are those of its variance; a fit estimates the same parts with its parameters"
 )
 
 
@@ -378,7 +377,8 @@ def _sentence(name: str, judge: CramerRaoBound, forecast: Forecast) -> str:
     verdict = verdict_of(name, judge)
     said = f"{SUBJECTS[name]} {verdict}: {source} it to {size} at best"
     if judge.peaks[name] < SEEN and error < LIMITS[name][1]:
-        said += f", but {CHANGES[name]} makes {judge.peaks[name]:.2g} of a sample's noise, where drift and model errors hide"
+        most = f"{judge.peaks[name]:.2g} of its noise"
+        said += f", but {CHANGES[name]} changes no sample by more than {most}, where drift and model errors hide"
     alone = [r.name for r in forecast.runs if r.believed and verdict_of(name, r) == CAN]
     if verdict == CAN and alone and len(forecast.runs) > 1:
         said += f"; {f'each of {joined(alone)}' if len(alone) > 1 else alone[0]} does so alone"

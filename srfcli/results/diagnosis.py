@@ -53,10 +53,10 @@ PARAMETERS = (
     Column("parameter", "", "name"),
     Column("baseline", "", "estimate"),
     Column("baseline_stderr", "", "its standard error", ".2g"),
-    Column("augmented", "", "estimate in the final model"),
+    Column("augmented", "", "estimate in the augmented model"),
     Column("augmented_stderr", "", "its standard error", ".2g"),
     Column("unit", "", "of the four before"),
-    Column("shift_sigma", "1", "shift of the baseline's estimate, in the final model's standard errors", ".1f"),
+    Column("shift_sigma", "1", "shift of the baseline's estimate, in the augmented model's standard errors", ".1f"),
 )
 RUNS = (
     Column("run", "", "name"),
@@ -166,12 +166,12 @@ class DiagnosisResult(Result):
 
     @property
     def parameter_table(self) -> Table:
-        """Return each parameter under baseline and final model."""
+        """Return each parameter under baseline and augmented model."""
         keys = ("name", "baseline", "baseline_stderr", "augmented", "augmented_stderr", "unit", "shift_sigma")
         rows = [tuple(r[k] for k in keys) for r in self._parameters]
         notes = []
         if _differ(self.answer):
-            notes.append("the baseline is fitted with the final model's field and gauge noise, to show what it lacks")
+            notes.append("the baseline is fitted with the augmented model's field and gauge noise, to show what it lacks")
         notes += self._alternatives
         return Table("srf.diagnose.parameters/1", PARAMETERS, rows, "parameters", tuple(notes))
 
@@ -346,12 +346,12 @@ class DiagnosisResult(Result):
 def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:
     """Return notes on an answer; not `recorded`: it rests on critical loads alone."""
     notes = list(found["reasons"])
-    for name, side in (("baseline", found["baseline"]), ("final model", found["augmented"])):
+    for name, side in (("baseline", found["baseline"]), ("augmented model", found["augmented"])):
         held = side["holdout"]["rms_over_noise"]
         rest = "" if held is None else f", {held:.4g} in those held out"
         field = side["field"]
         track = "needs no random friction" if field is None else f"needs random friction of {field['amplitude']:.2g}"
-        like = "with the final model's field and gauge noise, " if name == "baseline" and _differ(found) else ""
+        like = "with the augmented model's field and gauge noise, " if name == "baseline" and _differ(found) else ""
         told = f"rms over noise {side['fit']['rms_over_noise']:.4g} in"
         if recorded:
             notes.append(f"{name}: {track}; {like}{told} the runs fitted{rest}")

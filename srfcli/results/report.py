@@ -51,8 +51,8 @@ RUNS_SHOWN = 12  # runs whose figures are on the page; all are in the folder
 SHIFTED = 3.0  # standard errors from which a parameter is said to be shifted
 WIDTH = 0.05  # of a span: windows that are less apart are one in words
 SHADED = (
-    "Shaded are the times at which the baseline parts from the recording, the darker the more; that its parameters may have been "
-    "shifted to follow elsewhere is allowed for, so a residual may also be large outside."
+    "Shaded are the times at which the baseline differs from the recording, the darker the more; that its parameters may have "
+    "been shifted to follow elsewhere is allowed for, so a residual may also be large outside."
 )
 FILES = ("answer.json", "prediction-*.csv", "missing-*.csv", "augmented/**/*", "discriminating/**/*", "figures/*.svg")
 
@@ -129,7 +129,7 @@ def numbers(matter: Matter) -> Markup:
 
 
 def places(matter: Matter) -> Markup:
-    """Return where simulation and recording part, and computed and measured critical loads."""
+    """Return where the model differs from the recording, and computed and measured critical loads."""
     if matter.rows("thresholds") and not matter.traces:
         return section("where", "Critical loads, measured and computed", critical_loads(matter))
     caption = "Every run on its own clock; light is noise, dark is what the model does not explain."
@@ -148,7 +148,7 @@ def places(matter: Matter) -> Markup:
     parts += [_run(matter, one) for one in matter.fitted[1:RUNS_SHOWN]]
     if len(matter.fitted) > RUNS_SHOWN:
         parts.append(tag("p", f"The other {len(matter.fitted) - RUNS_SHOWN} runs are drawn in the folder figures."))
-    return section("where", "Where simulation and recording part", parts, critical_loads(matter), residual_scan(matter))
+    return section("where", "Where the model differs from the recording", parts, critical_loads(matter), residual_scan(matter))
 
 
 def critical_loads(matter: Matter) -> list[Any]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Figures of where simulation and recording part: all runs at a glance, and each run with its residual before and after.
+# Figures of where the model differs from the recording: all runs at a glance, and each run with its residual before and after.
 
 Array = NDArray[np.float64]
 

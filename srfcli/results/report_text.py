@@ -126,7 +126,7 @@ def remedy(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
         return "Go on with the parameters below; a fit with held-out runs shows how far they carry."
     if verdict == "identified":
         told = [text for e in effects if (text := _filled("remedy", e, material))]
-        rest = "go on with the augmented model in the folder beside this page, which has it"
+        rest = "continue with the augmented model, in the folder augmented beside this page"
         return _capital("; ".join([*told, rest])) + "."
     if verdict == "ambiguous":
         if material.get("discriminating"):

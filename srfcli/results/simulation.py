@@ -16,7 +16,7 @@ from srfcli.codegen.model import GeneratedModel
 from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.noise import measured
-from srfcli.data.values import AREA_GROWTH, OBSERVABLES, Declared, Experiment, Run, Signal
+from srfcli.data.values import AREA_GROWTH, OBSERVABLES, Declared, Experiment, Run, Signal, shown_unit
 from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.simulate import Trace, stick_slip
 from srfcli.results import plots
@@ -61,6 +61,15 @@ class Job:
     run: Run | None = None
     tables: tuple[Spline, ...] = ()
     beside: tuple[str, ...] = ()  # observables besides
+
+    @property
+    def load_known(self) -> bool:
+        """Return whether the load was stated or recorded."""
+        return self.run is None or self.run.load_known
+
+    def shown(self, unit: str) -> str:
+        """Return a unit as it is shown: MPa for N in a recording of stresses."""
+        return shown_unit(unit, stress=self.run is not None and self.run.stress)
 
 
 @dataclass(frozen=True)
@@ -186,19 +195,20 @@ class SimulationResult(Result):
         named = any(job.run is not None for job in jobs)
         gauge = any(r.measured is not None for r in self.records)
         ages = [name for name in model.states if name.startswith("ln_") and name != "ln_v"]
-        units = {OBSERVABLES[job.observable] for job in jobs}
+        units, force = {job.shown(OBSERVABLES[job.observable]) for job in jobs}, jobs[0].shown("N")
         unit = units.pop() if len(units) == 1 else "um, N or 1"
-        beside = [column for column in OTHERS if any(column.name in job.beside for job in jobs)]
+        named_beside = {name for job in jobs for name in job.beside}
+        beside = [replace(column, unit=jobs[0].shown(column.unit)) for column in OTHERS if column.name in named_beside]
         columns = (
             *([Column("run", "", "name of the run")] if named else []),
             Column("t", "s", "time"),
             Column("V", "um/s", "driving velocity"),
-            Column("W", "N", "imposed normal load"),
+            Column("W", force, "imposed normal load; empty where it is unknown"),
             Column("u", "um", "elongation of the spring"),
             Column("v", "um/s", "slip velocity"),
             *(Column(name[3:], "s", "age of the contacts") for name in ages),
             Column("mu", "1", "friction coefficient"),
-            Column("tau", "N", "friction force: mu times the load on the asperities"),
+            Column("tau", force, "friction force: mu times the load on the asperities; empty where it is unknown"),
             *([Column("recorded", unit, "what the run's file holds")] if named else []),
             *([Column("measured", unit, "the simulated observable through the gauge")] if gauge else []),
             *beside,
@@ -218,7 +228,7 @@ class SimulationResult(Result):
 
     def _panels(self) -> Figure:
         alone = len(self.records) == 1
-        panels = [_observable, _velocities, _load]
+        panels = [_observable, _velocities, *([_load] if all(r.job.load_known for r in self.records) else [])]
         if alone and self.records[0].job.observable != "friction":
             panels.insert(1, _friction)
         with plots.house_style():
@@ -227,7 +237,7 @@ class SimulationResult(Result):
                 axes = figure.subplots(len(panels), 1, sharex="col", squeeze=False).T
             else:
                 figure = plots.bare_figure((11.0, 1.7 * len(self.records) + 0.8))
-                axes = figure.subplots(len(self.records), 3, sharex="row", squeeze=False)
+                axes = figure.subplots(len(self.records), len(panels), sharex="row", squeeze=False)
             for row, record in zip(axes, self.records, strict=True):
                 for draw, ax in zip(panels, row, strict=True):
                     draw(ax, record)
@@ -275,8 +285,9 @@ def _block(
     n, trace = r.done, r.trace
     with np.errstate(over="ignore"):
         states = [np.exp(trace.state(name)) for name in ages]
-    load = _along(model, r.job, trace, "load")
-    columns = [trace.t, trace.V, trace.W, trace.u, trace.v, *states, trace.mu, (trace.W if load is None else load) * trace.mu]
+    W = trace.W if r.job.load_known else np.full(trace.t.size, np.nan)
+    load = _along(model, r.job, trace, "load") if r.job.load_known else None
+    columns = [trace.t, trace.V, W, trace.u, trace.v, *states, trace.mu, (W if load is None else load) * trace.mu]
     if named:
         assert r.job.run is not None
         columns.append(np.where(r.job.run.used, r.job.run.observed, np.nan))
@@ -358,7 +369,7 @@ def _simulated_run(work: Work, r: Record) -> Run:
 # Figures of records over time: friction, elongation, velocities and load, simulated and recorded.
 
 RECORDED = "#8A8A8A"
-LABELS = {"elongation": "u  [µm]", "force": "force  [N]", "friction": "friction"}
+LABELS = {"elongation": "u", "force": "force", "friction": "friction"}
 
 
 def _names(figure: Figure, axes: Iterable[Axes]) -> None:
@@ -379,7 +390,8 @@ def _observable(ax: Axes, record: Record) -> None:
     for name, values in beside.items():
         _line(ax, record, values, RECORDED, label=name, width=2.2)
     _line(ax, record, record.observed, plots.QUANTITY["u"], label="simulated" if beside else None)
-    ax.set_ylabel(LABELS[record.job.observable])
+    what = record.job.observable
+    ax.set_ylabel(plots.axis_label(LABELS[what], record.job.shown(OBSERVABLES[what])))
 
 
 def _friction(ax: Axes, record: Record) -> None:
@@ -404,7 +416,7 @@ def _load(ax: Axes, record: Record) -> None:
     _line(ax, record, W, plots.QUANTITY["W"])
     if np.ptp(W) < 1e-6 * W.max():
         ax.set_ylim(0.9 * W.min(), 1.1 * W.max())
-    ax.set_ylabel("W  [N]")
+    ax.set_ylabel(f"W  [{record.job.shown('N')}]")
 
 
 def _line(

@@ -163,11 +163,14 @@ def _drive(given: Any) -> list[tuple[float, float]] | float | None:
         return None if given is None else float(given)
     if not isinstance(given, str):
         return as_pairs(given, "drive", "(duration, velocity) pairs, in s and um/s: [(60, 3), (60, 10)]")
-    if ":" not in given:
+    if not {":", ","} & {*given}:
         return parse_quantity(given, "um/s", name="`drive`")
     steps = []
     for part in given.split(","):
-        duration, _, velocity = part.partition(":")
+        if part.count(":") != 1:
+            hint = "Write pieces with commas between them: `drive` '60:3, 60:10', in s and um/s."
+            raise SrfError(f"`drive`: {part.strip()!r} is not DURATION:VELOCITY", hint)
+        duration, velocity = part.split(":")
         steps.append((parse_quantity(duration, "s", name="`drive`"), parse_quantity(velocity, "um/s", name="`drive`")))
     return steps
 

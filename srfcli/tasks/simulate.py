@@ -565,7 +565,7 @@ def on_field(work: Work, model: GeneratedModel, field: FrictionField, *, start: 
         table = field.spline(place, place + _reach(work.model, job))
         state = start_state(model, appended(p, [table]), start, drive=job.drive, load=job.load.rest(begin), begin=begin)
         jobs.append(replace(job, p=p, start=state, tables=(table,)))
-    told = f"track: mu0 wanders by {field.amplitude:g} (standard deviation) over {field.length:g} um"
+    told = f"track: mu0 varies by {field.amplitude:g} (standard deviation) over {field.length:g} um"
     meta = {**work.meta, "track": {"amplitude": field.amplitude, "length_um": field.length}}  # as in the result of `srf fit`
     return replace(work, model=model, jobs=tuple(jobs), notes=(*work.notes, told), meta=meta)
 

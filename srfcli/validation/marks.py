@@ -56,8 +56,8 @@ class Mark:
 
     `class_right`: right, or ambiguous with the truth among what is listed or equivalent to it. `alarm`: something is said to be
     missing. `top` is the hypothesis with most confidence, `stated` that confidence, `hit` whether it is the truth; `error` the
-    held-out rms of the final model over that of the true one, `baseline_error` that of the baseline, `loads` how far the critical
-    loads of both are off (rms of the logarithm), beyond the recordings' velocities; `deviation` is the
+    held-out rms of the augmented model over that of the true one, `baseline_error` that of the baseline, `loads` how far the
+    critical loads of both are off (rms of the logarithm), beyond the recordings' velocities; `deviation` is the
     distance of an effect's size from the true one, where it was named rightly and alone: in standard errors, and relative.
     `own_track`: each run has a friction field of its own. `set_in` says in which apparatus, protocol, law, noise and field it was
     concealed. `located`: of an effect in one run, whether it is named and most of the misfit is placed in that run.
@@ -333,7 +333,7 @@ def deviation(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] |
 
 
 def load_errors(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] | None:
-    """Return how far critical loads are off those of the true equations, final model and baseline: rms of ln W0c/W0c.
+    """Return how far critical loads are off those of the true equations, augmented model and baseline: rms of ln W0c/W0c.
 
     At the velocities at which all three have one; None where there are none.
     """
