@@ -215,12 +215,12 @@ def test_equal_answers_give_equal_bytes(tmp_path: Path) -> None:
 SENTENCES: dict[str, list[str]] = {  # in their order: what is wrong, what to do, what is gained
     "none": [
         "Nothing is missing: the model explains the recordings down to the noise.",
-        "What to do. Go on with the parameters below;",
+        "What to do. Continue with the parameters below;",
         "residuals are 3.19 times the noise in the fitted runs, 4.75 times in the held-out ones.",
     ],
     "identified": [
         "A change of the load changes the age of contacts: alpha = 0.0120(4).",
-        'What to do. Add "+linker-dieterich" to the name of the ageing law, with alpha = 0.01200; go on with the augmented model',
+        'What to do. Add "+linker-dieterich" to the name of the ageing law, with alpha = 0.01200; continue with the augmented model',
         "Residuals fall from 3.19 to 0.99 times the noise in the fitted runs, and fall from 4.75 to 1.02 times in runs that",
         "It rests on 2 fitted runs, most on “onset” (61",
     ],

@@ -328,7 +328,7 @@ LIMITS = {"alpha": (0.05, 0.5), "lambda": (0.1, 1.0), "n": (0.1, 1.0)}
 # peaks over the noise of a sample, below which a parameter can hardly, and cannot, be identified
 SEEN, HIDDEN = 3.0, 0.3
 CAN = "can be identified"
-CHANGES = {"alpha": "alpha + 0.2", "lambda": "lambda + 10 %", "n": "n + 0.1"}
+CHANGES = {"alpha": "alpha +0.2", "lambda": "lambda +10 %", "n": "n +0.1"}
 SUBJECTS = {
     "alpha": "alpha (Linker-Dieterich: a change of load changes the age)",
     "lambda": "lambda (the interface's elastic length)",

@@ -123,7 +123,7 @@ def remedy(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     """Return what to do about it, in a sentence or two."""
     effects, verdict = [str(e) for e in answer.get("effects", ())], answer.get("verdict")
     if verdict == "none":
-        return "Go on with the parameters below; a fit with held-out runs shows how far they carry."
+        return "Continue with the parameters below; a fit with held-out runs shows how far they carry."
     if verdict == "identified":
         told = [text for e in effects if (text := _filled("remedy", e, material))]
         rest = "continue with the augmented model, in the folder augmented beside this page"
