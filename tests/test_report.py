@@ -220,7 +220,7 @@ SENTENCES: dict[str, list[str]] = {  # in their order: what is wrong, what to do
     ],
     "identified": [
         "A change of the load changes the age of contacts: alpha = 0.0120(4).",
-        'What to do. Add "+linker-dieterich" to the name of the ageing law, with alpha = 0.01200; continue with the augmented model',
+        'What to do. Add "+linker-dieterich" to the name of the ageing law, with alpha = 0.01200; continue with the augmented',
         "Residuals fall from 3.19 to 0.99 times the noise in the fitted runs, and fall from 4.75 to 1.02 times in runs that",
         "It rests on 2 fitted runs, most on “onset” (61",
     ],

@@ -20,7 +20,7 @@ from srfcli.core.units import describe, find_unit, parse_quantity, to_base
 if TYPE_CHECKING:
     from srfcli.codegen.model import Array, GeneratedModel
     from srfcli.codegen.slider import SlidingSystem
-    from srfcli.numerics.plane import MapAxis, MapGrid
+    from srfcli.numerics.plane import MapAxis
 
 # `srf map`: the stability of the forced sliding state over a plane of two parameters.
 
@@ -86,7 +86,7 @@ def map_(
     options.check_axes({name for r in over for name in r.name.split("/")}, given)
     slider = system.slider(**given)
     slider.model.check_changing_load(slider.vector())
-    grid = read_grid(slider.model, slider.vector(), over)
+    x, y = read_axes(slider.model, slider.vector(), over)
     settings = ContinuationSettings(tol=system.tolerance(tol).value, max_mesh=max_mesh, steps=StepSettings(largest=step))
     warn_uncompiled("a map takes about three times as long")
     begun, mapped = time.perf_counter(), 0.0
@@ -103,7 +103,7 @@ def map_(
             progress.advance(0, note=said)
 
         found = task.map(
-            slider, x=grid.x, y=grid.y, grid=MapSettings(mesh_error=mesh_error, depth=depth), curves=settings,
+            slider, x=x, y=y, grid=MapSettings(mesh_error=mesh_error, depth=depth), curves=settings,
             boundaries=boundaries, criticality=criticality, run=spread.run, tiles=tiles, progress=then,
         )  # fmt: skip
     timings = {"map": mapped, "boundaries": time.perf_counter() - begun - mapped}
@@ -130,22 +130,16 @@ def _boundary_output(boundary: str, output: options.OutputOptions) -> options.Ou
 COLUMNS, ROWS = 80, 120  # points of an axis for which none were given
 
 
-def read_grid(model: GeneratedModel, base: Array, over: tuple[options.Range, ...]) -> MapGrid:
-    """Return the grid that `over` spans; V from 1 to 100 um/s and a window of K/W0 stand in for an axis not given.
+def read_axes(model: GeneratedModel, base: Array, over: tuple[options.Range, ...]) -> tuple[MapAxis, MapAxis]:
+    """Return the axes that `over` describes; V from 1 to 100 um/s and a window of K/W0 stand in for an axis not given.
 
     Raises SrfError for more than two axes, for lists of values, and for what is no parameter of the model.
     """
-    from srfcli.numerics.plane import MapGrid, check_grid
-
     if len(over) > 2:
         raise SrfError(f"--over is given {len(over)} times", "A map has two axes: --over V=1:100:120 --over K/W0=0.005:0.03:200.")
     ranges = over or (replace(options.parse_over("V=1:100"), n=COLUMNS),)
-    axes = [read_axis(model, r) for r in ranges]
-    if len(axes) == 1:
-        axes.append(_load_axis(model, base, axes[0]))
-    grid = MapGrid(base, axes[0], axes[1])
-    check_grid(model, grid)
-    return grid
+    x, *others = [read_axis(model, r) for r in ranges]
+    return x, others[0] if others else _load_axis(model, base, x)
 
 
 def read_axis(model: GeneratedModel, given: options.Range) -> MapAxis:
