@@ -144,11 +144,13 @@ def test_an_experiment_is_read_checked_and_fitted(tmp_path: Path, monkeypatch: p
 
 def test_formulas_and_code_are_those_of_the_commands(slider: srf.SlidingSystem, tmp_path: Path) -> None:
     def printed(*arguments: str) -> str:
-        done = CliRunner().invoke(cli, [*arguments, "--law", "log-log", "--ageing", "ruina"])
+        done = CliRunner().invoke(
+            cli, [*arguments, *["--law", "dieterich-ruina", "--ageing", "ruina", "--interface", "rigid", "--no-inertia"]]
+        )
         assert done.exit_code == 0, done.stderr
         return done.stdout
 
-    other = srf.system("log-log", ageing="ruina", K=0.3)  # values do not matter
+    other = srf.system("dieterich-ruina", ageing="ruina", interface="rigid", inertia=False, K=0.3)  # values do not matter
     found = srf.derive(other, extras="jacobian")
     assert found.text == printed("derive", "--with", "jacobian")
     assert found.latex == printed("derive", "--with", "jacobian", "--format", "latex")
@@ -210,9 +212,9 @@ def test_comparing_names_what_was_matched() -> None:
         srf.compare({"a": srf.system()})
     laws = {name: srf.system(ageing=name) for name in ("dieterich", "ruina")}
     small = {"columns": 4, "rows": 6}
-    found = srf.compare(laws, eps=0.13, V=(5, 40), K_over_W0=(0.006, 0.03), points=small)
-    options = ("--ageing", "dieterich", "--ageing", "ruina", "--over", "V=5:40:4", "--over", "K/W0=0.006:0.03:6")
-    assert [list(r) for r in found.table.rows] == rows_of("compare", *options, "--eps", "0.13")
+    found = srf.compare(laws, eps=0.09, V=(5, 20), K_over_W0=(0.015, 0.03), points=small)
+    options = ("--ageing", "dieterich", "--ageing", "ruina", "--over", "V=5:20:4", "--over", "K/W0=0.015:0.03:6")
+    assert [list(r) for r in found.table.rows] == rows_of("compare", *options, "--eps", "0.09")
     pytest.importorskip("matplotlib")
     named = [text.get_text() for text in found.plot().legends[0].get_texts()]
     assert any(text.startswith("ruina, matched with") and "D$_0$ =" in text for text in named)

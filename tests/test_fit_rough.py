@@ -21,6 +21,7 @@ from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, Track, move
 
+PLAIN = Physics(rigid=True, massless=True)  # of two unknowns of motion
 PLANS = (
     Plan("up", ((0.6, 20), (0.6, 60)), 3.0, 0.002),
     Plan("down", ((0.8, 50), (0.4, 15)), 3.0, 0.002),
@@ -71,7 +72,7 @@ def test_sudden_falls_are_fitted_from_a_slider_that_would_not_stick(tmp_path):
 
 @pytest.fixture(scope="module", params=[(3, 3, 3), (3, 4, 5)], ids=["one track", "own tracks"])
 def fitted(request, tmp_path_factory):
-    folder, rng, base = tmp_path_factory.mktemp("rough"), np.random.default_rng(5), Physics()
+    folder, rng, base = tmp_path_factory.mktemp("rough"), np.random.default_rng(5), PLAIN
     tracks = [Track(2e-3, 6.0, seed) for seed in request.param]
     readings = {
         q: read_gauge(move(replace(base, track=track), q).u, Gauge(), rng) for q, track in zip(PLANS, tracks, strict=True)
@@ -99,7 +100,7 @@ def test_a_run_that_was_held_out_is_predicted(fitted):
 
 def test_parameters_are_those_concealed_within_their_errors(fitted):
     _, found = fitted
-    truth = Physics()
+    truth = PLAIN
     for row in found["rows"]:
         assert abs(row["value"] - getattr(truth, row["parameter"])) < 3.5 * row["stderr"], row
 
@@ -107,7 +108,7 @@ def test_parameters_are_those_concealed_within_their_errors(fitted):
 @pytest.fixture(scope="module")
 def offset(tmp_path_factory):
     """Three runs under two loads whose mu0 are apart by 2e-3 and -1e-3, one more held out; everything else is alike."""
-    folder, rng, base = tmp_path_factory.mktemp("offset"), np.random.default_rng(5), Physics()
+    folder, rng, base = tmp_path_factory.mktemp("offset"), np.random.default_rng(5), PLAIN
     plans = [Plan(f"up{k}", ((0.6, 20), (0.6, 60)), 4.0 if k == 1 else 3.0, 0.006, holdout=k == 3) for k in range(4)]
     moved = zip(plans, (0.0, 2e-3, -1e-3, 1e-3), strict=True)
     readings = {q: read_gauge(move(replace(base, mu0=base.mu0 + off), q).u, Gauge(), rng) for q, off in moved}

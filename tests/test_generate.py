@@ -24,10 +24,10 @@ from srfcli.codegen.numpy_source import generate
 from srfcli.laws.registry import bundled_registry
 from srfcli.symbolic.system import build_system
 
-for names in ({}, {"law": "dieterich-ruina", "ageing": "ruina", "interface": "rigid", "loading": "inclined", "inertia": False}):
-    system = build_system(bundled_registry(), **names)
-    text = generate(system) + render.to_latex(system, derivation(system, ())) + render.to_python(system)
-    print(hashlib.sha256(text.encode()).hexdigest())
+names = {"law": "dieterich-ruina", "ageing": "ruina", "interface": "rigid", "loading": "inclined", "inertia": False}
+system = build_system(bundled_registry(), **names)
+text = generate(system) + render.to_latex(system, derivation(system, ())) + render.to_python(system)
+print(hashlib.sha256(text.encode()).hexdigest())
 """
 
 
@@ -37,8 +37,7 @@ def test_text_does_not_depend_on_the_hash_seed() -> None:
         environment = {**os.environ, "PYTHONHASHSEED": seed}
         done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=environment, check=True)
         outputs.append(done.stdout)
-    assert len(outputs[0].split()) == 2
-    assert outputs[0] == outputs[1]
+    assert outputs[0] == outputs[1] != ""
 
 
 def test_code_is_the_module(model: Any, tmp_path: Path) -> None:

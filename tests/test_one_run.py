@@ -37,7 +37,7 @@ def srf(*arguments) -> Result:
 
 def written(folder, only, plans=PLANS):
     """Write the recordings of the independent generator: the load pushes along the track in the runs `only`."""
-    rng, calm = np.random.default_rng(5), Physics()
+    rng, calm = np.random.default_rng(5), Physics(rigid=True, massless=True)
     pushed = replace(calm, cross=SHARE)
     readings = {p: read_gauge(move(pushed if p.name in only else calm, p).u, Gauge(), rng) for p in plans}
     for name, text in case_files("one run", calm, readings).items():

@@ -74,11 +74,9 @@ def test_a_changed_equation_is_found_out(entry: dict[str, Any]) -> None:
 
 
 def test_command() -> None:
-    result = CliRunner().invoke(cli, ["derive", "--check-paper"], catch_exceptions=False)
-    assert result.exit_code == 0
-    assert "25 agree, 1 misprinted" in result.output
-    assert result.output.isascii()
-    document = json.loads(CliRunner().invoke(cli, ["derive", "--check-paper", "--format", "json"]).output)
+    result = CliRunner().invoke(cli, ["derive", "--check-paper", "--format", "json"], catch_exceptions=False)
+    assert result.exit_code == 0 and result.output.isascii()
+    document = json.loads(result.output)
     assert document["schema"] == "srf.derive-paper/1"
     assert len(document["findings"]) == 41
     assert CliRunner().invoke(cli, ["derive", "--check-paper", "--format", "latex"]).exit_code != 0

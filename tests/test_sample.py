@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from recording_cases import write
+from recording_cases import TOML, write
 
 from srfcli.cli.main import cli
 from srfcli.inference.posterior import Posterior, draw, effective_size
@@ -89,7 +89,7 @@ def test_fit_prints_what_its_draws_are_worth(tmp_path: Path) -> None:
     pytest.importorskip("emcee", reason="EMCEE ABSENT: nothing can be drawn")
     folder = tmp_path / "small"
     folder.mkdir()
-    write(folder)
+    write(folder, toml=TOML.partition('[[runs]]\nname = "two"')[0])  # only A is fitted
     done = CliRunner().invoke(cli, ["fit", str(folder), "--track", "smooth", "--sample", "300", "--json"], prog_name="srf")
     assert done.exit_code in (0, 3), done.stderr
     found = json.loads(done.stdout)

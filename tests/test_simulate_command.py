@@ -27,7 +27,7 @@ from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment
 from srfcli.laws.registry import load_registry
 
-SHS = ("--W0", "5", "--drive", "1:10, 100:0, 3:10")
+SHS = ("--W0", "5", "--drive", "1:10, 100:0, 3:10", "--rate", "100")
 
 
 pytestmark = pytest.mark.usefixtures("empty_folder")

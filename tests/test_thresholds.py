@@ -494,9 +494,3 @@ def test_intervals_are_errors_where_the_likelihood_is_quadratic(fit_command: Any
     for row in data["rows"]:
         assert row["high"] - row["low"] == pytest.approx(2 * 1.96 * row["stderr"], rel=0.03)
     assert not any("quadratic" in n for n in data["notes"])
-
-
-def test_a_threshold_far_above_that_without_modulation_is_found(model: Any) -> None:
-    """At V = 100 um/s and eps = 0.3 the load is 619.634 N, beyond the window around the critical load without modulation."""
-    found = generated(model, np.array([100.0]), np.array([0.3]), values=model.defaults())
-    assert found.W0c[0] == pytest.approx(619.634, rel=1e-5)
