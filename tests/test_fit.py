@@ -249,9 +249,9 @@ def test_stick_slip_from_afar(make_model):
 
 def test_several_starts_agree_and_are_seeded(rock_model):
     problem = fit_problem(rock_model, rock(rock_model, runs=1))
-    found = fit_from_several(problem, smooth=True, count=2, seed=4)
-    assert len(found.rows) == 2 and all(same for _, same in found.rows) and not found.interrupted
-    assert fit_from_several(problem, smooth=True, count=2, seed=4).best.values == found.best.values
+    best, rows, interrupted = fit_from_several(problem, smooth=True, count=2, seed=4)
+    assert len(rows) == 2 and all(same for _, same in rows) and not interrupted
+    assert fit_from_several(problem, smooth=True, count=2, seed=4)[0].values == best.values
 
 
 def test_starts_that_were_not_done_are_not_passed_over(rock_model):
@@ -262,8 +262,8 @@ def test_starts_that_were_not_done_are_not_passed_over(rock_model):
         if text.startswith("start 2 of 3"):
             raise KeyboardInterrupt
 
-    found = fit_from_several(problem, smooth=True, count=3, seed=4, progress=stop)
-    assert found.interrupted and len(found.rows) == 1
+    _, rows, interrupted = fit_from_several(problem, smooth=True, count=3, seed=4, progress=stop)
+    assert interrupted and len(rows) == 1
 
 
 @pytest.mark.parametrize(

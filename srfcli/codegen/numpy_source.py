@@ -196,7 +196,7 @@ def generate(system: System) -> str:
         linear = linearise(system)
         _write_statics(writer, eq, linear)
         _write_closed(writer, system)
-        polynomial, forms = linear.polynomial_degree, linear.names
+        polynomial, forms = -1 if linear.hurwitz is None else len(linear.hurwitz) - 1, linear.names
     _write_rates(writer, still)
     _write_cycle(writer, eq)
     facts = {"ELASTIC": system.elastic, "INERTIA": system.inertia, "HOPF_DEGREE": polynomial}

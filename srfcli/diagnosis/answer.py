@@ -58,17 +58,8 @@ def _view(before: Filtered, after: Filtered, holdout: bool) -> RunView:
     return RunView(replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), (white[0], white[1]), others)
 
 
-def answer(
-    diagnosis: Diagnosis,
-    location: Location,
-    *,
-    model: str = "augmented/experiment.toml",
-    discriminating: DiscriminatingRun | None = None,
-) -> dict[str, Any]:
-    """Return the object of the format `srf.diagnose/1`; `model` is where the augmented experiment is, relative to it.
-
-    `discriminating` is the run that discriminates between what is ambiguous.
-    """
+def answer(diagnosis: Diagnosis, location: Location, *, discriminating: DiscriminatingRun | None = None) -> dict[str, Any]:
+    """Return the object of the format `srf.diagnose/1`; `discriminating` is the run that tells apart what is ambiguous."""
     views, loads, last = run_views(diagnosis), load_views(diagnosis), diagnosis.best
     sides = {}
     for place, (name, fitted, own) in enumerate((("baseline", diagnosis.shown, diagnosis.baseline), ("augmented", last, last))):
@@ -88,7 +79,7 @@ def answer(
         "confidence": dict(diagnosis.confidence),
         **sides,
         "location": location.described(),
-        "model": model,
+        "model": "augmented/experiment.toml",
         "reasons": list(diagnosis.reasons),
     }
     if diagnosis.acts_in:

@@ -37,7 +37,6 @@ from srfcli.symbolic.system import apart, in_a_model, without_part
 # The augmented model as an experiment that every other command accepts: fitted laws, effects, the same recordings.
 
 COPIED_BYTES = 256 * 2**20  # bytes of recordings that are copied; larger ones stay where they are, and are named from there
-LAW_KINDS = ("friction", "ageing", "interface")
 LAW_OPTIONS = (("--law", "friction.toml"), ("--ageing", "ageing.toml"), ("--interface", "interface.toml"))
 
 
@@ -95,7 +94,7 @@ def augment(
     text = experiment.stiffness_text if "K" not in values else f"{shortest(K, 1.0)!r} {base}"
     rig = {key: description["apparatus"][key] for key in GEOMETRY if key in description["apparatus"]}
     rig |= {"stiffness": as_recorded(text, experiment)} | ({"mass": f"{shortest(mass, KILOGRAM)!r} kg"} if mass else {})
-    model: dict[str, object] = {"law" if kind == "friction" else kind: f"{kind}.toml" for kind in LAW_KINDS}
+    model: dict[str, object] = {"law" if kind == "friction" else kind: f"{kind}.toml" for kind in KIND_OF_SLOT.values()}
     model |= {"inertia": inertia} | ({"effects": effects} if effects else {})
     vary = [name if by == experiment.by else f"{name}:{by}" for name, by in experiment.vary.items()]
     model |= {"vary": vary, "by": experiment.by} if vary else {}
@@ -161,7 +160,7 @@ def _parts(described: Sequence[Mapping[str, Any]], home: Path, folder: Path) -> 
     small = sum(p.stat().st_size for p in set(paths.values())) <= COPIED_BYTES
     copies: dict[str, Path] = {}
     names: dict[Path, str] = {}
-    taken = {DESCRIPTION, *(f"{kind}.toml" for kind in LAW_KINDS)}
+    taken = {DESCRIPTION, *(f"{kind}.toml" for kind in KIND_OF_SLOT.values())}
     runs = []
     for run in described:
         path = paths[str(run["file"])]
@@ -192,11 +191,13 @@ class MergedLaws:
 
     def law(self, slot: str) -> Law:
         """Return the law that has a slot."""
-        return {"mu": self.friction, "rate": self.ageing, "kappa": self.interface}[slot]
+        law: Law = getattr(self, KIND_OF_SLOT[slot])
+        return law
 
     def formula(self, slot: str) -> sp.Expr | None:
         """Return the formula in a slot; None for a rigid interface."""
-        return {"mu": self.friction.mu, "rate": self.ageing.rate, "kappa": self.interface.kappa}[slot]
+        found: sp.Expr | None = getattr(self.law(slot), slot)
+        return found
 
 
 def merge(registry: Registry, choice: ModelChoice, effects: Sequence[Effect]) -> MergedLaws:
@@ -240,21 +241,18 @@ def _merged(laws: MergedLaws, effect: Effect, stays: Sequence[Effect]) -> Merged
     states = _states(laws, effect)
     if states is None:
         return None
-    law = laws.law(slot)
+    law, kind = laws.law(slot), KIND_OF_SLOT[slot]
     new = formula.xreplace({symbol(slot): before})
     parameters = (*law.parameters, *(p for p in in_a_model(effect) if p.name not in {q.name for q in law.parameters}))
     every = (*laws.friction.states, *states)
-    known = known_symbols(KIND_OF_SLOT[slot], (p.name for p in parameters), every)
+    known = known_symbols(kind, (p.name for p in parameters), every)
     if not {str(s) for s in new.free_symbols} <= set(known) or not _sayable(new, known):
         return None
-    changed = laws.changed | {KIND_OF_SLOT[slot]}
     common: dict[str, Any] = {"parameters": parameters, "cites": tuple(dict.fromkeys((*law.cites, *effect.cites))), "checks": ()}
     common["about"] = f"{law.about.rstrip('.')}; {effect.about[:1].lower()}{effect.about[1:]}"
-    if slot == "mu":
-        return replace(laws, friction=replace(laws.friction, mu=new, states=every, **common), changed=changed)
-    if slot == "rate":
-        return replace(laws, ageing=replace(laws.ageing, rate=new, **common), changed=changed)
-    return replace(laws, interface=replace(laws.interface, kappa=new, **common), changed=changed)
+    common |= {"states": every} if slot == "mu" else {}
+    written: dict[str, Any] = {kind: replace(law, **{slot: new}, **common)}
+    return replace(laws, **written, changed=laws.changed | {kind})
 
 
 def _commute(slot: str, formula: sp.Expr, other: Effect) -> bool:

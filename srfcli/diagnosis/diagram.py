@@ -105,24 +105,17 @@ def _model(registry: Registry, experiment: Experiment, at: Mapping[str, float] |
 
 def _loads(model: GeneratedModel, base: Array, V: Array) -> Array:
     """Return the critical load under constant load at each velocity, NaN for none."""
-    found = [critical_point(model, _at(model, base, V=v))[0] for v in V.tolist()]
+    found = [critical_point(model, model.with_values(base, V=v))[0] for v in V.tolist()]
     return np.array([np.nan if point is None else point.W0 for point in found])
-
-
-def _at(model: GeneratedModel, base: Array, **values: float) -> Array:
-    p = base.copy()
-    for name, value in values.items():
-        p[model.index(name)] = value
-    return p
 
 
 def _boundary(
     model: GeneratedModel, base: Array, V: Array, f: float, eps: float, side: str, notes: list[str]
 ) -> dict[str, Array]:
     """Return velocities and loads of the boundary under modulation, its components one after another, NaN between them."""
-    corners = [_at(model, base, V=v) for v in np.geomspace(V[0], V[-1], SCANNED_VELOCITIES)]
+    corners = [model.with_values(base, V=v) for v in np.geomspace(V[0], V[-1], SCANNED_VELOCITIES)]
     low, high = load_window(model, corners)
-    forced = _at(model, base, f=f, eps=eps, V=float(V[0]))
+    forced = model.with_values(base, f=f, eps=eps, V=float(V[0]))
     plane = Plane(forced, Axis("V", float(V[0]), float(V[-1])), Axis("W0", low, high))
     *_, boundary = find_components(model, plane, DRAWN)
     if not boundary.branches:

@@ -141,17 +141,11 @@ class Hypothesis:
             return experiment
         return replace(experiment, choice=replace(experiment.choice, ageing=self.ageing))
 
-    def model(self, registry: Registry, experiment: Experiment, *, random_field: bool = True) -> GeneratedModel:
-        """Return the model, with a random friction field along slip unless that is left out; of critical loads without runs."""
-        if not experiment.runs:
-            return self.stability(registry, experiment)
+    def model(self, registry: Registry, experiment: Experiment, *, stability: bool = False) -> GeneratedModel:
+        """Return the model with a random friction field along slip; that of critical loads for `stability` or without runs."""
         choice = self.experiment(experiment).choice.plus(e.name for e in self.effects)
-        return open_model(registry, **asdict(choice), random_field=random_field, stability=False)
-
-    def stability(self, registry: Registry, experiment: Experiment) -> GeneratedModel:
-        """Return the model of critical loads."""
-        choice = self.experiment(experiment).choice.plus(e.name for e in self.effects)
-        return open_model(registry, **asdict(choice), stability=True)
+        stability = stability or not experiment.runs
+        return open_model(registry, **asdict(choice), random_field=not stability, stability=stability)
 
     def priors(self, model: GeneratedModel) -> dict[str, tuple[float, float]]:
         """Return the neutral and the typical size of each effect's parameters in a model, by their names there, in um, s, N."""
@@ -163,24 +157,18 @@ class Hypothesis:
         return found
 
     def problem(
-        self,
-        registry: Registry,
-        experiment: Experiment,
-        *,
-        at: Mapping[str, float] | None = None,
-        trend: str | None = None,
-        random_field: bool = True,
+        self, registry: Registry, experiment: Experiment, *, at: Mapping[str, float] | None = None, trend: str | None = None
     ) -> Problem:
         """Return the fit of baseline and effects together, from the values in `at` where there are some."""
         experiment = self.experiment(experiment)
-        model = self.model(registry, experiment, random_field=random_field)
+        model = self.model(registry, experiment)
         added = [q for e in self.effects for q in fit_parameters(e, model, experiment)]
         added += law_parameters(registry, self.ageing, experiment) if self.ageing else []
         at = at or {}
         names = {q.name for q in added}
         kept = [q for q in experiment.parameters if q.name not in names]
         listed = tuple(replace(q, value=float(np.clip(at.get(q.name, q.value), q.lower, q.upper))) for q in (*kept, *added))
-        stability = self.stability(registry, experiment) if experiment.thresholds else None
+        stability = self.model(registry, experiment, stability=True) if experiment.thresholds else None
         listed_in = replace(experiment, parameters=listed)
         problem = fit_problem(model, listed_in, trend=trend, stability=stability)
         start = [at.get(n, s) for n, s in zip(problem.names, problem.start, strict=True)]

@@ -17,13 +17,11 @@ from srfcli.codegen.c_source import GAUGE_PROCESSES, LANES, SIGNALS, compiled
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError
 from srfcli.motion.imposed import Drive, Load
-from srfcli.motion.integrators import doubles, imposed_arguments, interruptible, rtol_of_estimate
+from srfcli.motion.integrators import doubles, imposed_arguments, integers, interruptible, rtol_of_estimate
 
 STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
 
 GAUGE, SPRING = -1, -2  # what a reading shows: the elongation as the gauge has it, or as it is; from 0 on a state
-
-_INTS = ctypes.POINTER(ctypes.c_int)
 
 
 @dataclass(frozen=True)
@@ -140,10 +138,9 @@ def kalman_filter(
     n, k, states = t.size, p.d.shape[-1], len(model.states)
     if len(order) > GAUGE_PROCESSES * SIGNALS or signals.number.max() >= SIGNALS:
         raise SrfError(f"more than {GAUGE_PROCESSES} processes of gauge noise a signal, or more than {SIGNALS} signals")
-    wide, own, owner = states + sum(order), *(np.array([*a, 0], dtype=np.intc) for a in (order, signals.owner))
+    wide, own, owner = states + sum(order), integers(np.array([*order, 0])), integers(np.array([*signals.owner, 0]))
     weighed = model.index("weighed") if "weighed" in model.names else -1
-    rates = np.ascontiguousarray(rate, dtype=np.intc)
-    number, shows = (np.ascontiguousarray(a, dtype=np.intc) for a in (signals.number, signals.shows))
+    rates, number, shows = integers(rate), integers(signals.number), integers(signals.shows)
     nu, S = np.full(n, np.nan), np.full(n, np.nan)
     nu_d, S_d = np.full((n, k), np.nan), np.full((n, k), np.nan)
     shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide), (n, wide)) if keep else ((1,),) * 5
@@ -157,8 +154,7 @@ def kalman_filter(
         keeping = keep and first == 0
         arguments = (
             *imposed, doubles(p.packed(first)), doubles(start.packed(first)), doubles(covariance.packed(first)),
-            len(order), own.ctypes.data_as(_INTS), owner.ctypes.data_as(_INTS), doubles(gauge.packed(first)),
-            rates.ctypes.data_as(_INTS), number.ctypes.data_as(_INTS), shows.ctypes.data_as(_INTS), doubles(signals.weighs),
+            len(order), own, owner, doubles(gauge.packed(first)), rates, number, shows, doubles(signals.weighs),
             weighed,
             int(k > 0), ctypes.c_double(size), doubles(allowed),
             ctypes.c_long(most), n,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
+from srfcli.codegen.model import COMPLEX_STEP, Array, ComplexArray, GeneratedModel
 from srfcli.codegen.splines import Spline, appended
 from srfcli.core.errors import Status
 from srfcli.data.imposed import find_modulation
@@ -22,7 +22,6 @@ from srfcli.motion.integrators import integrate
 
 # What belongs to one run alone and is estimated with the parameters: its unobserved initial state, a trend of its observable.
 
-TINY = 1e-30  # imaginary step: exact to rounding, as nothing is subtracted
 GAUGES = {"slip": ("slip",), "contact_area": ("area", "area_growth")}  # of an observable: what its gauge's reading depends on
 FREE_START_WIDTH = 0.1  # least distance of the bounds of a free start's friction: a run may begin without any
 
@@ -103,7 +102,7 @@ def start_state(
         S0 = np.zeros((x0.size, len(by)))
         for k, name in enumerate(by):
             if name in places:
-                S0[:, k] = _slope(model.steady, p, places[name])
+                S0[:, k] = derivative(model.steady, p, places[name])
         return x0, S0
     return _balanced(model, run, p, values, by, places)
 
@@ -120,14 +119,14 @@ def _balanced(
         x[states.index(age)] = values[f"{run.name}.{age}"]
     for _ in range(60):  # Newton in ln v; friction is close to linear there
         moved = x.copy()
-        moved[iv] += 1j * TINY
+        moved[iv] += 1j * COMPLEX_STEP
         found = model.friction(moved, V, W, 0.0, p)
-        step = (mu - found.real) / (found.imag / TINY)
+        step = (mu - found.real) / (found.imag / COMPLEX_STEP)
         x[iv] += np.clip(step, -3.0, 3.0)
         if abs(step) < 1e-13 * (1 + abs(x[iv])):
             break
     x = x.real
-    of_state = [float(_slope(lambda y: model.friction(y, V, W, 0.0, p.astype(complex)), x, i)) for i in range(x.size)]
+    of_state = [float(derivative(lambda y: model.friction(y, V, W, 0.0, p.astype(complex)), x, i)) for i in range(x.size)]
     S = np.zeros((x.size, len(by)))
     for k, name in enumerate(by):
         own = name.partition(f"{run.name}.")[2]
@@ -137,7 +136,7 @@ def _balanced(
             S[states.index(own), k] = 1.0
             S[iv, k] = -of_state[states.index(own)] / of_state[iv]
         elif name in places:
-            S[iv, k] = -_slope(lambda q: model.friction(x.astype(complex), V, W, 0.0, q), p, places[name]) / of_state[iv]
+            S[iv, k] = -derivative(lambda q: model.friction(x.astype(complex), V, W, 0.0, q), p, places[name]) / of_state[iv]
     if "u" in states:
         stiffness = model.namespace.get("stiffness") or (lambda x, V, W, W_dot, p: p[model.index("K")])
         K, u = float(stiffness(x, V, W, 0.0, p)), states.index("u")
@@ -146,18 +145,18 @@ def _balanced(
             if name == f"{run.name}.mu":
                 S[u, k] = W / K
             elif name in places:
-                S[u, k] = -W * mu / K**2 * _slope(lambda q: stiffness(x, V, W, 0.0, q), p, places[name])
+                S[u, k] = -W * mu / K**2 * derivative(lambda q: stiffness(x, V, W, 0.0, q), p, places[name])
     if "z" in states:
         x[states.index("z")] = np.exp(x[iv])
         S[states.index("z")] = np.exp(x[iv]) * S[iv]
     return x, S
 
 
-def _slope(function: Callable[[ComplexArray], ComplexArray], p: Array, place: int) -> Array:
+def derivative(function: Callable[[ComplexArray], ComplexArray], p: Array, place: int) -> Array:
     """Return the derivative of a function of `p` (k,) or (n, k) by the number, or the column, at `place`."""
     q = p.astype(complex)
-    q[..., place] += 1j * TINY
-    return np.asarray(np.asarray(function(q)).imag / TINY)
+    q[..., place] += 1j * COMPLEX_STEP
+    return np.asarray(np.asarray(function(q)).imag / COMPLEX_STEP)
 
 
 def _ages(model: GeneratedModel) -> list[str]:
@@ -275,7 +274,7 @@ def predict(
 
     Of a model with tables, J goes on with a column for each number of the tables in `by_tables`.
 
-    It starts in steady sliding, or where `values` say (see `nuisance`). A trend is added to the observable: values["RUN.trend"]
+    It starts in steady sliding, or where `values` say (see `own_names`). A trend is added to the observable: values["RUN.trend"]
     times displacement or time. Values are in um, s, N.
     """
     p = run_parameters(model, experiment, run, values)
@@ -321,10 +320,10 @@ def _observe(
         with np.errstate(all="ignore"):
             u = np.asarray(reading(x, V, W, W_dot, p))
             for j in range(x.shape[1] if places else 0):
-                J += _slope(lambda y: reading(y, V, W, W_dot, p), x, j)[:, None] * S[:, j, :]
+                J += derivative(lambda y: reading(y, V, W, W_dot, p), x, j)[:, None] * S[:, j, :]
             for k, i in enumerate(places):
                 if i >= 0:
-                    J[:, k] += _slope(lambda q: reading(x.astype(complex), V, W, W_dot, q), p, i)
+                    J[:, k] += derivative(lambda q: reading(x.astype(complex), V, W, W_dot, q), p, i)
     if run.observable != "elongation" and model.index("K") in places:
         J[:, list(places).index(model.index("K"))] += u / K
     return factor * u, factor[:, None] * J

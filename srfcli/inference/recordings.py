@@ -133,29 +133,29 @@ def fit_recordings(
         )
     smooth = None if track is None else track == "smooth"
     try:
-        several = fit_from_several(problem, smooth=smooth, count=starts, seed=seed, progress=progress)
+        likeliest, rows, interrupted = fit_from_several(problem, smooth=smooth, count=starts, seed=seed, progress=progress)
     except Interrupted as error:
         found = stopped(problem, error.found)
         return RecordingFit(problem, as_fit(found), found, _track(found), (), Status.INTERRUPTED)
-    scatter = _scatter(several.best)
-    found = _drawn_together(several.best, scatter) if prior and not several.interrupted else several.best
+    scatter = _scatter(likeliest)
+    found = _drawn_together(likeliest, scatter) if prior and not interrupted else likeliest
     best = as_fit(found)
-    status = Status.INTERRUPTED if several.interrupted else best.status
-    result = RecordingFit(found.likelihood.problem, best, found, _track(found), tuple(several.rows), status, scatter)
-    if several.interrupted or len(problem.runs) < 2 or problem.tables:
+    status = Status.INTERRUPTED if interrupted else best.status
+    result = RecordingFit(found.likelihood.problem, best, found, _track(found), tuple(rows), status, scatter)
+    if interrupted or len(problem.runs) < 2 or problem.tables:
         return result
     try:
         asked = ask_shared and track is None and not (experiment.vary or any(run.others for run in problem.runs))
         if not (track == "shared" or (asked and field_correlation(found) > ALIKE_FIELDS)):
             return result
         tabled = open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),))
-        shared = fit_shared(replace(problem, model=tabled), best, progress=progress)
+        shared, field = fit_shared(replace(problem, model=tabled), best, progress=progress)
     except KeyboardInterrupt:
         return replace(result, status=Status.INTERRUPTED)
-    if track is None and shared.fit.log_likelihood < best.log_likelihood + NEEDED:
+    if track is None and shared.log_likelihood < best.log_likelihood + NEEDED:
         return result
-    common = FittedField(shared.prior.amplitude, shared.prior.length, True) if shared.prior.amplitude else FittedField()
-    return replace(result, fit=shared.fit, state_space=None, friction_field=common, status=shared.fit.status)
+    common = FittedField(field.amplitude, field.length, True) if field.amplitude else FittedField()
+    return replace(result, fit=shared, state_space=None, friction_field=common, status=shared.status)
 
 
 def _track(found: StateSpaceFit) -> FittedField | None:
@@ -183,18 +183,6 @@ def start_points(problem: Problem, count: int, seed: int) -> list[Array]:
     return points
 
 
-@dataclass(frozen=True)
-class Several:
-    """Fits from several starts: the best, and for each start that ended a row.
-
-    A row is the log likelihood, and whether that start ended in the best one's minimum. `interrupted` where not all were done.
-    """
-
-    best: StateSpaceFit
-    rows: list[tuple[float, bool]]
-    interrupted: bool
-
-
 def fit_from_several(
     problem: Problem,
     *,
@@ -202,10 +190,11 @@ def fit_from_several(
     count: int = 1,
     seed: int = 0,
     progress: Callable[[str], None] = lambda text: None,
-) -> Several:
-    """Return the best fit over the starts; `smooth` as in `fit_state_space`.
+) -> tuple[StateSpaceFit, list[tuple[float, bool]], bool]:
+    """Return the best fit over the starts, a row for each that ended, and whether it was interrupted before all were done.
 
-    Ctrl-C ends them where one is done, and is `Interrupted` where none is.
+    A row is the log likelihood, and whether that start ended in the best one's minimum; `smooth` is as in `fit_state_space`.
+    Ctrl-C is `Interrupted` where no start is done.
     """
     fits: list[StateSpaceFit] = []
     interrupted = False
@@ -226,7 +215,7 @@ def fit_from_several(
     errors = np.maximum(np.sqrt(np.diag(best.covariance)), 1e-300)
     away = [max(abs(f.values[n] - best.values[n]) / e for n, e in zip(problem.names, errors, strict=False)) for f in fits]
     rows = [(f.log_likelihood, d < ONE_MINIMUM) for f, d in zip(fits, away, strict=True)]
-    return Several(best, rows, interrupted)
+    return best, rows, interrupted
 
 
 # Whether all runs have one and the same random friction field.

@@ -54,16 +54,8 @@ class FieldPrior:
 USUAL = FieldPrior(3e-4, 8.0)  # of a track until its own is estimated: polished contacts wander by so much
 
 
-@dataclass(frozen=True)
-class SharedFit:
-    """A fit in which all runs slid on one track, and what that is like."""
-
-    fit: Fit
-    prior: FieldPrior
-
-
-def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] = lambda text: None) -> SharedFit:
-    """Return the fit in which mu0 wanders along one track that all runs share, from where another fit stands.
+def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] = lambda text: None) -> tuple[Fit, FieldPrior]:
+    """Return the fit in which mu0 varies along a track that all runs share, and what that is like, from where another fit stands.
 
     The problem's model has the table ("mu", "slip"). Noise, field and parameters are estimated in turn until they agree.
     Held-out runs are judged on that track.
@@ -90,7 +82,7 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
         begun, values=problem.named(point.theta), covariance=likelihood.covariance(point), runs=runs, log_likelihood=total,
         status=Status.OK, evaluations=begun.evaluations + likelihood.evaluations,
     )  # fmt: skip
-    return SharedFit(fitted, point.prior)
+    return fitted, point.prior
 
 
 def _track(runs: Sequence[Run]) -> Spline:

@@ -35,9 +35,9 @@ from srfcli.inference.fit import Fit, Problem, RunFit, inverse
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
-    TINY,
     Prediction,
     basis,
+    derivative,
     first_elongation,
     own_names,
     own_start,
@@ -363,21 +363,14 @@ def _belief(
 def _field_columns(model: GeneratedModel, run: Run, p: Array, x0: Array) -> Array:
     """Return how the start (n,) answers to the field's two standard normal values there, (n, 2)."""
     states, out = list(model.states), np.zeros((x0.size, 2))
+    V, W = float(run.drive(run.t[:1])[0]), run.load.rest(float(run.t[0]))
     for j, name in enumerate(("field_start", "field_slope_start")):
         if run.initial != "free":
-            q = p.astype(complex)
-            q[model.index(name)] += 1j * TINY
-            out[:, j] = np.asarray(model.steady(q)).imag / TINY
+            out[:, j] = derivative(model.steady, p, model.index(name))
             continue
         place = states.index(name.removesuffix("_start"))
         out[place, j] = p[model.index("field_amplitude")]
-        t0 = float(run.t[0])
-        V, W = float(run.drive(run.t[:1])[0]), run.load.rest(t0)
-        moved = []
-        for i in (place, states.index("ln_v")):
-            x = x0.astype(complex)
-            x[i] += 1j * TINY
-            moved.append(float(np.asarray(model.friction(x, V, W, 0.0, p)).imag) / TINY)
+        moved = [float(derivative(lambda x: model.friction(x, V, W, 0.0, p), x0, i)) for i in (place, states.index("ln_v"))]
         out[states.index("ln_v"), j] = -out[place, j] * moved[0] / moved[1]  # friction there is what the start says
         if "z" in states:
             out[states.index("z"), j] = x0[states.index("z")] * out[states.index("ln_v"), j]
@@ -525,12 +518,8 @@ class Likelihood:
 
         Of one `signal` alone, where its number is given. A run that was held out has those of what was sampled most alike.
         """
-        found, rates = [self.gauge_like(kind) for kind in self.kinds_of(run)], len(run.sampling.spacings)
+        found, rates = [self.gauge_names(self.kind_like(kind)) for kind in self.kinds_of(run)], len(run.sampling.spacings)
         return found if signal is None else found[signal * rates : (signal + 1) * rates]
-
-    def gauge_like(self, kind: Kind) -> dict[str, str]:
-        """Return the names of the gauge noise of the kind that is most like this one."""
-        return self.gauge_names(self.kind_like(kind))
 
     def kind_like(self, kind: Kind) -> Kind:
         """Return which of the kinds of gauge noise here is most like this one."""
@@ -1224,7 +1213,7 @@ def _carried(found: StateSpaceFit, likelihood: Likelihood) -> dict[str, float]:
     """Return the values of a fit, by name, with those of its gauge noise under the names that another likelihood has."""
     values, own = dict(found.values), found.likelihood
     for kind in likelihood.kinds:
-        known = own.gauge_like(kind)
+        known = own.gauge_names(own.kind_like(kind))
         values |= {name: values[known[n]] for n, name in likelihood.gauge_names(kind).items() if n in known}
     return values
 

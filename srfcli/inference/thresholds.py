@@ -165,13 +165,9 @@ class Matcher:
         residuals = (loads - self.table.W0c) / self.table.sigma
         return Match(y, loads, residuals, rivals, np.array([c is None for c in chosen]), tuple(chosen))
 
-    def load_rates(self, match: Match) -> Array:
-        """Return dW0c/dy (n, k) at a match, exact; 0 for a missing crossing, whose stand-in does not move."""
-        return self._load_rates(list(match.crossings), match.y)
-
     def jacobian(self, match: Match) -> Array:
-        """Return d(residuals)/dy (n, k) at a match."""
-        return self.load_rates(match) / self.table.sigma[:, None]
+        """Return d(residuals)/dy (n, k) at a match, exact; 0 for a missing crossing, whose stand-in does not move."""
+        return self._load_rates(list(match.crossings), match.y) / self.table.sigma[:, None]
 
     def _load_rates(self, crossings: list[Crossing | None], y: Array, rows: list[int] | None = None) -> Array:
         rows = list(range(len(crossings))) if rows is None else rows

@@ -122,7 +122,7 @@ class EffectReader(LawReader):
         formulas = [*(slot for slot in SLOTS if slot in self.table), *self.state_names()]
         given = sorted((known | {*SLOTS}) - {c.name for c in constants})
         effect = Effect(
-            name=self.name(), parameters=parameters, about=self.text("about"), cites=self.cites(), source=str(self.path),
+            name=self.name(), parameters=parameters, about=self.text("about"), cites=self.listed("cites"), source=str(self.path),
             changes=tuple((slot, self.slot(slot, known | {slot})) for slot in SLOTS if slot in self.table),
             states=self.extra(known), settings=self.settings(), frees=self.listed("frees"), neutral=neutral, scans=scans,
             needs=self.listed("needs"), lacks=self.listed("lacks"), observed=self.text("observed"),
@@ -177,28 +177,21 @@ class EffectReader(LawReader):
                     self.fail(f"{where}.{key}", f"'{text}' is in {describe(found)}, {p.name} in {p.unit}")
                 yield p.name, which, formula
 
-    def parameter(self, name: str, entry: object) -> Parameter:
-        """Return one parameter."""
-        if isinstance(entry, dict):
+    def parameter(self, name: str, entry: object, table: str = "parameters", value: str = "default") -> Parameter:
+        """Return one parameter, or one of the constants."""
+        if table == "constants":
+            node = self.at(f"{table}.{name}", entry).table(f'{name} = {{ value = 7.0, unit = "N" }}.')
+            self.keys(f"{table}.{name}", node.value, _CONSTANT)
+        elif isinstance(entry, dict):
             self.keys(f"parameters.{name}", entry, _PARAMETER)
-            if not isinstance(entry.get("fixed", False), bool):
-                self.fail(f"parameters.{name}.fixed", "expected true or false")
+            self.at(f"parameters.{name}.fixed", entry.get("fixed", False)).boolean()
             entry = {k: v for k, v in entry.items() if k not in _OWN}
-        return super().parameter(name, entry)
+        return super().parameter(name, entry, table, value)
 
     def constants(self) -> tuple[Parameter, ...]:
         """Return the numbers with units that the formulas name."""
-        table = self.table.get("constants", {})
-        if not isinstance(table, dict):
-            self.fail("constants", "expected a table", 'Write [constants] and Wref = { value = 7.0, unit = "N" }.')
-        found = []
-        for name, entry in table.items():
-            where = f"constants.{name}"
-            if not isinstance(entry, dict) or "value" not in entry:
-                self.fail(where, "expected a table with a value", f'Write {name} = {{ value = 7.0, unit = "N" }}.')
-            self.keys(where, entry, _CONSTANT)
-            found.append(super().parameter(name, {"default": entry["value"], **{k: v for k, v in entry.items() if k != "value"}}))
-        return tuple(found)
+        table = self.at("constants", self.table.get("constants", {})).table('[constants] and Wref = { value = 7.0, unit = "N" }.')
+        return tuple(self.parameter(name, entry, "constants", "value") for name, entry in table.value.items())
 
     def slot(self, slot: str, known: Iterable[str]) -> sympy.Expr:
         """Return the formula of a slot."""
@@ -226,38 +219,25 @@ class EffectReader(LawReader):
             for key in ("name", "rate", "steady"):
                 if not isinstance(entry.get(key), str):
                     self.fail(f"{where}.{key}", "missing, or not text in quotes")
-            if not isinstance(entry.get("logarithmic", False), bool):
-                self.fail(f"{where}.logarithmic", "expected true or false")
+            logarithmic = self.at(f"{where}.logarithmic", entry.get("logarithmic", False)).boolean()
             taken = (known | {state.name for state in found}) - {entry["name"]}
             try:
                 check_identifier(entry["name"], "state", taken=taken | _TAKEN)
                 rate, steady = (parse_expression(entry[key], known) for key in ("rate", "steady"))
             except SrfError as error:
                 self.fail(where, error.message, error.hint)
-            found.append(ExtraState(entry["name"], rate, steady, entry.get("logarithmic", False)))
+            found.append(ExtraState(entry["name"], rate, steady, logarithmic))
         return tuple(found)
 
     def settings(self) -> tuple[tuple[str, str | bool], ...]:
         """Return the choices of the model that the effect replaces."""
-        table = self.table.get("settings", {})
-        if not isinstance(table, dict):
-            self.fail("settings", "expected a table", 'Write settings = { interface = "elastic" }.')
+        table = self.at("settings", self.table.get("settings", {})).table('settings = { interface = "elastic" }.').value
         self.keys("settings", table, ("interface", "inertia"))
         for key, kind in (("interface", str), ("inertia", bool)):
             if not isinstance(table.get(key, kind()), kind):
                 self.fail(f"settings.{key}", f"found {table[key]!r}", 'Write interface = "elastic" or inertia = true.')
         return tuple(sorted(table.items()))
 
-    def listed(self, key: str) -> tuple[str, ...]:
-        """Return a list of names."""
-        value = self.table.get(key, [])
-        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-            self.fail(key, "expected a list of names in quotes")
-        return tuple(value)
-
     def flag(self, key: str, default: bool) -> bool:
         """Return true or false."""
-        value = self.table.get(key, default)
-        if not isinstance(value, bool):
-            self.fail(key, "expected true or false")
-        return value
+        return self.at(key, self.table.get(key, default)).boolean()

@@ -43,7 +43,7 @@ LAW_CLASSES: dict[str, type[Law]] = {
 LAW_NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*", re.ASCII)
 
 _COMMON_KEYS = ("format", "kind", "name", "about", "cites", "parameters", "checks")
-_PARAMETER_KEYS = ("default", "unit", "lower", "upper", "bounds", "about")
+_PARAMETER_KEYS = ("unit", "lower", "upper", "bounds", "about")
 _CHECK_KEYS = ("quantity", "at", "value", "rtol")
 _STATE_KEYS = ("name", "length", "weight")
 
@@ -210,7 +210,7 @@ class LawReader:
         common: dict[str, Any] = {
             "name": self.name(),
             "about": self.text("about"),
-            "cites": self.cites(),
+            "cites": self.listed("cites"),
             "parameters": self.parameters(),
             "source": str(self.path),
         }
@@ -242,11 +242,12 @@ class LawReader:
         with self.placed(key):
             return parse_expression(text, names)
 
-    def cites(self) -> tuple[str, ...]:
-        cites = self.table.get("cites", [])
-        if not isinstance(cites, list) or not all(isinstance(c, str) for c in cites):
-            self.at("cites", cites).expected("a list of texts")
-        return tuple(cites)
+    def listed(self, key: str) -> tuple[str, ...]:
+        """Return a list of texts."""
+        value = self.table.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+            self.at(key, value).expected("a list of texts")
+        return tuple(value)
 
     def parameters(self) -> tuple[Parameter, ...]:
         table = self.table.get("parameters", {})
@@ -254,20 +255,20 @@ class LawReader:
             self.at("parameters", table).expected("a table", "Write [parameters].")
         return tuple(self.parameter(name, entry) for name, entry in table.items())
 
-    def parameter(self, name: str, entry: object) -> Parameter:
-        where = f"parameters.{name}"
+    def parameter(self, name: str, entry: object, table: str = "parameters", value: str = "default") -> Parameter:
+        where = f"{table}.{name}"
         if not isinstance(entry, dict):
             if name in (*_COMMON_KEYS, *FORMULA.values(), "states"):
                 self.fail(where, "this key stands below [parameters]", "Move it above the first [table].")
             self.at(where, entry).expected("a table", f'Write {name} = {{ default = 1.0, unit = "1" }}.')
-        self.keys(where, entry, _PARAMETER_KEYS)
-        if "default" not in entry:
-            self.fail(f"{where}.default", "missing", "Every parameter has a default.")
+        self.keys(where, entry, (value, *_PARAMETER_KEYS))
+        if value not in entry:
+            self.fail(f"{where}.{value}", "missing", f"Write {name} = {{ {value} = 1.0 }}.")
         for key in ("unit", "about"):
             if not isinstance(entry.get(key, ""), str):
                 self.at(f"{where}.{key}", entry[key]).expected("text in quotes")
         lower, upper = self.bounds(where, entry)
-        default = self.number(f"{where}.default", entry["default"])
+        default = self.number(f"{where}.{value}", entry[value])
         return Parameter(name, default, entry.get("unit", "1"), lower, upper, entry.get("about", ""))
 
     def bounds(self, where: str, entry: Mapping[str, Any]) -> tuple[float, float]:

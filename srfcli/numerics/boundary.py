@@ -234,17 +234,14 @@ def along(name: str, count: int, *, log: bool = True, unit: float = 1.0) -> Dire
 class BoundaryPoint:
     """A located point of a stability boundary; `p` in the model's order, `rho` the critical multiplier.
 
-    `name` is the parameter whose rise crosses the boundary; `error` is the estimated relative error of its value, `low` and
-    `high` bracket it, `residual` is ln |rho| at the point, `others` the largest modulus among the other multipliers, `slope`
-    is d ln|rho| / d ln(name), the other parameters fixed: where positive, stability is lost as `name` rises.
+    `error` is the estimated relative error of the parameter that was moved there, `residual` the square of the last step of
+    Newton's method, or ln |rho| where it did not converge, `others` the largest modulus among the other multipliers, `slope` is
+    d ln|rho| by the logarithm of that parameter, the others fixed: where positive, stability is lost as it rises.
     """
 
     p: Array
-    name: str
     rho: complex
     error: float
-    low: float
-    high: float
     residual: float
     others: float
     slope: float
@@ -320,23 +317,19 @@ def polish(
             done = (error <= tol) | ~fine.converged | (mesh >= max_mesh)
             for j in np.nonzero(done)[0]:
                 end = int(index[here[j]])
-                points[end] = _point(model, fine, int(j), direction.names[-1], float(error[j]), tol)
+                points[end] = _point(fine, int(j), float(error[j]), tol)
             again = np.nonzero(~done)[0]
             if again.size:
                 waiting.append((index[here[again]], fine.p[:, again], fine.orbit.part(again), fine.rho[again]))
     return [q for q in points if q is not None]
 
 
-def _point(model: GeneratedModel, r: _Polished, j: int, name: str, error: float, tol: float) -> BoundaryPoint:
-    value = float(r.p[model.index(name), j])
+def _point(r: _Polished, j: int, error: float, tol: float) -> BoundaryPoint:
     status = Status.OK if error <= tol else Status.TOLERANCE
     return BoundaryPoint(
         p=r.p[:, j].copy(),
-        name=name,
         rho=complex(r.rho[j]),
         error=error,
-        low=value * (1 - error),
-        high=value * (1 + error),
         residual=float(r.residual[j]),
         others=float(r.others[j]),
         slope=float(r.slope[j]),

@@ -1,7 +1,7 @@
 """Points of a stability boundary where something changes; which way a Neimark-Sacker bifurcation opens.
 
 They are folds and cusps of the curve, resonances, and zeros of a caller's function.
-Between two neighbouring points of a polished branch a test function of opposite signs is brought to zero (Chandrupatla's method);
+Between two neighbouring points of a polished branch a test function of opposite signs is brought to zero (Brent's method);
 each trial is corrected onto the boundary on the hyperplane across the chord, which joins the points in parameters and state.
 """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import sympy as sp
@@ -15,6 +15,7 @@ from srfcli.symbolic.derive import (
     ClosedLimits,
     characteristic_polynomial,
     closed_limits,
+    common_ageing,
     friction_slopes,
     in_law_parameters,
     interface_meaning,
@@ -46,10 +47,6 @@ class Section:
     title: str
     formulas: tuple[Formula, ...]
     notes: tuple[str, ...] = ()
-
-    def without_zeros(self) -> Section:
-        """Return the section without the formulas that are zero."""
-        return replace(self, formulas=tuple(f for f in self.formulas if f.value != 0))
 
 
 def derivation(system: System, extras: Sequence[str] = EXTRAS) -> tuple[Section, ...]:
@@ -122,10 +119,9 @@ def _jacobian(system: System) -> Section:
     formulas = []
     for name, rate in zip(eq.names, eq.rates, strict=True):
         for j, other in enumerate(eq.names):
-            value = eq.derivative(rate, j)
-            text, latex = _partial(name, other)
-            formulas.append(Formula(text, latex, sp.factor_terms(value)))
-    return Section("jacobian", "Jacobian", tuple(formulas), ("derivatives that are not listed are zero",)).without_zeros()
+            if (value := sp.factor_terms(eq.derivative(rate, j))) != 0:
+                formulas.append(Formula(*_partial(name, other), value))
+    return Section("jacobian", "Jacobian", tuple(formulas), ("derivatives that are not listed are zero",))
 
 
 def _parameters(system: System) -> Section:
@@ -137,10 +133,10 @@ def _parameters(system: System) -> Section:
     for name, rate in zip(eq.names, eq.rates, strict=True):
         driven = rate.subs(imposed)
         for parameter in system.parameters:
-            text, latex = _partial(name, parameter.name)
-            formulas.append(Formula(text, latex, sp.factor_terms(sp.diff(driven, symbol(parameter.name)))))
+            if (value := sp.factor_terms(sp.diff(driven, symbol(parameter.name)))) != 0:
+                formulas.append(Formula(*_partial(name, parameter.name), value))
     note = "with the imposed load W0 (1 + eps cos(2 pi f t)); derivatives that are not listed are zero"
-    return Section("parameters", "Derivatives by the parameters", tuple(formulas), (note,)).without_zeros()
+    return Section("parameters", "Derivatives by the parameters", tuple(formulas), (note,))
 
 
 def _partial(name: str, other: str) -> tuple[str, str]:
@@ -232,7 +228,7 @@ def _by_weakening(ratio: sp.Expr) -> sp.Expr:
 def _validity(system: System, found: ClosedLimits) -> str:
     ageing = "+".join([system.ageing.name, *(m.name for m in system.modifiers)])
     form = "(ln phi)' = -(V/D0) (d ln v + d ln phi)"
-    if found.common_ageing:
+    if common_ageing(system):
         return f"exact for any kappa and M where no limit is named: one state, and {ageing} is linearised as {form}"
     return f"{ageing} is not linearised as {form} in this system: the paper's forms do not hold, those listed do"
 

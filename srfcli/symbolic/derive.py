@@ -33,11 +33,6 @@ class Linearisation:
     hurwitz: tuple[sp.Expr, ...] | None
     names: dict[str, str] = field(default_factory=dict)
 
-    @property
-    def polynomial_degree(self) -> int:
-        """Return the degree in W0 of the Hurwitz determinant, -1 where it is not a polynomial."""
-        return -1 if self.hurwitz is None else len(self.hurwitz) - 1
-
 
 def slope_symbols(system: System) -> tuple[sp.Symbol, tuple[sp.Symbol, ...]]:
     """Return the symbols mu_v and mu_phi (one for each state) of the paper."""
@@ -223,16 +218,14 @@ class ClosedLimits:
     """W0c and Omega_c^2 in mu_v, mu_phi, mu_ss, the interface's and the apparatus' symbols; None where not closed.
 
     `load` is exact for any kappa and M and holds the symbol Omega_c where inertia counts; `limit_load` is that for kappa to
-    infinity, `quasistatic_load` for kappa to infinity without inertia. `common_ageing` says that the ageing law is
-    linearised as -(V/D0) (d ln v + d ln phi), for which Omega_c is the paper's. A load counts where it is positive and
-    Omega_c is real.
+    infinity, `quasistatic_load` for kappa to infinity without inertia. Omega_c is the paper's where the ageing law is linearised
+    as it is (`common_ageing`). A load counts where it is positive and Omega_c is real.
     """
 
     omega_squared: sp.Expr | None
     load: sp.Expr | None
     limit_load: sp.Expr | None
     quasistatic_load: sp.Expr | None
-    common_ageing: bool
 
 
 def common_ageing(system: System) -> bool:
@@ -267,7 +260,7 @@ def closed_limits(system: System) -> ClosedLimits | None:
     if free is None and limit is None and slow is None:
         return None
     load, limit_load, quasistatic_load = (None if e is None else e[0] for e in (exact, limit, slow))
-    return ClosedLimits(None if free is None else free[1], load, limit_load, quasistatic_load, common_ageing(system))
+    return ClosedLimits(None if free is None else free[1], load, limit_load, quasistatic_load)
 
 
 def in_law_parameters(system: System, expression: sp.Expr) -> sp.Expr:
