@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.interpolate import BSpline
 from sparse_signals import Array, Baseline, Signals, Sizes, columns
 
 from srfcli.codegen.splines import Spline
@@ -84,10 +85,8 @@ def rows(reading: Reading, p: Sizes, names: Sequence[str], *, residual: bool = T
 def track_columns(found: Rows) -> Array:
     """Return (n, m) a spline over slip that all runs share, whitened as the rows are."""
     spline = Spline.over(float(found.slip.min()), float(found.slip.max()), KNOTS)
-    cell, weights = spline.weights(found.slip)
-    T = np.zeros((found.y.size, spline.coefficients.size))
-    for k in range(4):
-        T[np.arange(cell.size), cell + k] = weights[:, k] / found.error
+    knots = spline.first + spline.spacing * (np.arange(spline.coefficients.size + 4) - 3)
+    T = BSpline.design_matrix(found.slip, knots, 3).toarray() / found.error[:, None]
     T = T[:, np.abs(T[~found.held]).sum(axis=0) > 0]
     return T - 0.0
 

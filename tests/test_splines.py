@@ -21,29 +21,23 @@ needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler on
 TABLES = (("mu", "slip"), ("mu", "time"), ("V", "stage"))
 
 
+def knots(s: Spline) -> np.ndarray:
+    return s.first + s.spacing * (np.arange(s.coefficients.size + 4) - 3)
+
+
 def scipy_spline(s: Spline) -> BSpline:
-    knots = s.first + s.spacing * (np.arange(s.coefficients.size + 4) - 3)
-    return BSpline(knots, s.coefficients, 3)
+    return BSpline(knots(s), s.coefficients, 3)
 
 
 def some(seed: int = 1, *, first: float = -1.5, spacing: float = 0.7, n: int = 12) -> Spline:
     return Spline(first, spacing, np.random.default_rng(seed).standard_normal(n))
 
 
-@pytest.mark.parametrize("n", [4, 5, 12])
-def test_values_are_those_of_scipy(n):
-    s = some(n=n)
-    x = np.linspace(s.first, s.last, 203)[1:-1]
-    assert s(x) == pytest.approx(scipy_spline(s)(x), abs=1e-13)
-    assert s.design(x) @ s.coefficients == pytest.approx(scipy_spline(s)(x), abs=1e-13)
-    assert s.design(x).sum(axis=1) == pytest.approx(1.0, abs=1e-14)
-
-
 @pytest.mark.parametrize("order", [0, 1, 2])
-@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("which", [0, 1, 2])
 def test_look_up_behind_parameters(order, which):
-    """Two tables behind three parameters: each is found, and its derivatives are scipy's."""
-    tables = (some(2), some(3, first=10.0, spacing=2.0, n=7))
+    """Tables behind three parameters: each is found, and its derivatives are scipy's."""
+    tables = (some(2), some(3, first=10.0, spacing=2.0, n=7), some(4, n=4))
     p = appended(np.array([7.0, 8.0, 9.0]), tables)
     s, expected = tables[which], scipy_spline(tables[which])
     lut = tables_after(3)[order]
@@ -60,7 +54,6 @@ def test_beyond_its_knots_a_table_is_constant():
     beyond = np.array([s.first - 5.0, s.first - 1e-9, s.last + 1e-9, s.last + 100.0])
     ends = scipy_spline(s)(np.array([s.first, s.first, s.last, s.last]))
     assert lut(p, 0, beyond) == pytest.approx(ends, abs=1e-8)
-    assert s(beyond) == pytest.approx(ends, abs=1e-8)
     assert (lut1(p, 0, beyond) == 0).all() and (lut2(p, 0, beyond) == 0).all()
 
 
@@ -71,7 +64,6 @@ def test_at_no_number_a_table_is_none_and_its_neighbours_are_unharmed():
         one, other = value(p, 0, np.array([np.nan, 2.5]))
         assert np.isnan(one) and np.isnan(value(p, 0, np.nan))
         assert other == pytest.approx(scipy_spline(s).derivative(order)(2.5) if order else scipy_spline(s)(2.5))
-    assert np.isnan(s(np.array([np.nan]))).all()
 
 
 def test_complex_steps_see_argument_and_numbers():
@@ -80,10 +72,11 @@ def test_complex_steps_see_argument_and_numbers():
     lut, lut1, _ = tables_after(1)
     x = np.linspace(s.first + 0.1, s.last - 0.1, 31)
     assert np.imag(lut(p, 0, x + 1j * step)) / step == pytest.approx(lut1(p, 0, x), abs=1e-12)
+    design = BSpline.design_matrix(x, knots(s), 3).toarray()
     for k in range(s.coefficients.size):
         q = p.astype(complex)
         q[int(p[1]) + k] += 1j * step
-        assert np.imag(lut(q, 0, x)) / step == pytest.approx(s.design(x)[:, k], abs=1e-14)
+        assert np.imag(lut(q, 0, x)) / step == pytest.approx(design[:, k], abs=1e-14)
 
 
 def test_no_numbers_no_table():
@@ -101,10 +94,10 @@ def test_knots_cover_what_is_asked_for(low, width, spacing):
     assert s.coefficients.size == round((s.last - s.first) / s.spacing) + 3 and not s.coefficients.any()
     peak = s.nodes[1]  # where its own bump is highest, at the first knot
     assert peak == pytest.approx(s.first)
-    assert s.design(np.array([peak]))[0].argmax() == 1
+    assert BSpline.design_matrix(np.array([peak]), knots(s), 3).toarray()[0].argmax() == 1
     line = s.with_coefficients(2.0 + 3.0 * s.nodes)  # a spline whose numbers lie on a line is that line
-    x = np.linspace(s.first, s.last, 17)
-    assert line(x) == pytest.approx(2 + 3 * x, rel=1e-9, abs=1e-9)
+    x = np.linspace(s.first, s.last, 17)[1:-1]
+    assert scipy_spline(line)(x) == pytest.approx(2 + 3 * x, rel=1e-9, abs=1e-9)
 
 
 # ---- in a motion

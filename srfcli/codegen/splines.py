@@ -31,11 +31,6 @@ class Spline:
         intervals = max(int(np.ceil((high - low) / spacing)), 1)
         return cls(low, (high - low) / intervals, np.zeros(intervals + 3))
 
-    @classmethod
-    def none(cls) -> Spline:
-        """Return a table without coefficients, which is 0 everywhere."""
-        return cls(0.0, 1.0, np.zeros(0))
-
     @property
     def last(self) -> float:
         """Return where the last interval ends."""
@@ -45,23 +40,6 @@ class Spline:
     def nodes(self) -> Array:
         """Return the centre of each coefficient's basis function (n,)."""
         return np.asarray(self.first + self.spacing * (np.arange(self.coefficients.size) - 1.0))
-
-    def weights(self, x: Array) -> tuple[NDArray[np.int64], Array]:
-        """Return, for each x (m,), the first of the four coefficients that count there, and their weights (m, 4)."""
-        cell, share = _cells(self.first, self.spacing, self.coefficients.size, np.asarray(x, dtype=float))
-        return cell, np.stack(_WEIGHTS[0](share), axis=-1)
-
-    def design(self, x: Array) -> Array:
-        """Return the matrix (m, n) that turns the coefficients into values at x (m,)."""
-        cell, weights = self.weights(x)
-        out = np.zeros((np.size(x), self.coefficients.size))
-        for k in range(4):
-            out[np.arange(np.size(x)), cell + k] += weights[:, k]
-        return out
-
-    def __call__(self, x: Array) -> Array:
-        """Return the values at x."""
-        return self.design(np.atleast_1d(x)) @ self.coefficients
 
     def with_coefficients(self, coefficients: Array) -> Spline:
         """Return the same knots with other coefficients."""

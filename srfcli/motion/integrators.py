@@ -84,7 +84,7 @@ def integrate(
     count = len(by) + sum(tables[i].coefficients.size for i in by_tables)
     S0 = np.zeros((start.size, count)) if S0 is None else np.ascontiguousarray(S0, dtype=float)
     missing = len(model.namespace.get("TABLES", ())) - len(tables)
-    p = appended(np.asarray(p, dtype=float), [*tables, *[Spline.none()] * missing]) if tables or missing else p
+    p = appended(np.asarray(p, dtype=float), [*tables, *[Spline(0.0, 1.0, np.zeros(0))] * missing]) if tables or missing else p
     if library is None:
         if by_tables:
             raise SrfError("derivatives by a table's numbers need a C compiler", "install one, or the package ziglang")
