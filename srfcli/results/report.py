@@ -241,7 +241,7 @@ def merged(windows: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
 def _run(matter: Matter, one: report_figures.Trace) -> Markup:
     before, after = one.rms
     fell = f"{rms(before)}" if matter.same else f"{rms(before)} before, {rms(after)} after"
-    where = f"; they part at the shaded times, furthest from {spans([one.worst])}" if one.worst else ""
+    where = f"; they differ at the shaded times, furthest from {spans([one.worst])}" if one.worst else ""
     alt = f"Run {one.name}: recording, simulations and residuals over time{where}."
     caption = f"{one.name}: residual over noise {fell}{where}. Dotted lines: two standard deviations of the noise."
     if one.unexplained is not None:

@@ -391,7 +391,8 @@ def _observable(ax: Axes, record: Record) -> None:
         _line(ax, record, values, RECORDED, label=name, width=2.2)
     _line(ax, record, record.observed, plots.QUANTITY["u"], label="simulated" if beside else None)
     what = record.job.observable
-    ax.set_ylabel(plots.axis_label(LABELS[what], record.job.shown(OBSERVABLES[what])))
+    unit = record.job.shown(OBSERVABLES[what])
+    ax.set_ylabel(plots.axis_label("shear stress" if unit == "MPa" else LABELS[what], unit))
 
 
 def _friction(ax: Axes, record: Record) -> None:
