@@ -12,7 +12,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.numerics.collocation import solved
 from srfcli.numerics.continuation import ContinuationSettings, StepSettings, find_components
 from srfcli.numerics.critical import critical_line
-from srfcli.numerics.map import STABILITY_KINDS, _suspects, compute_map, join_tiles, kinds, neighbours, per_slip, solve_tile
+from srfcli.numerics.map import STABILITY_KINDS, compute_map, join_tiles, kinds, neighbours, per_slip, solve_tile, suspects
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.orbit import forced_guess, robust_orbits, steady_guess, uniform_mesh
 from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane, tile_tasks
@@ -232,7 +232,7 @@ def test_an_interrupted_map_keeps_what_is_finished(model):
     ],
 )
 def test_which_cells_are_halved(corners, error, wanted):
-    assert _suspects(np.array([corners]), np.array([error])).tolist() == [wanted]
+    assert suspects(np.array([corners]), np.array([error])).tolist() == [wanted]
 
 
 def test_neighbours_interpolate_cubics_exactly():

@@ -109,8 +109,8 @@ def test_draws_are_kept_only_where_some_are_made(tmp_path: Path) -> None:
 
 
 def test_too_few_steps_are_told() -> None:
-    from srfcli.results.fit import _posterior_notes
+    from srfcli.results.fit import posterior_notes
 
     few = Posterior(("x",), ar1(0.5, steps=5), 2, 0.5, interrupted=True)
-    assert "too few steps to tell" in _posterior_notes(few)[0]
-    assert "interrupted" in _posterior_notes(few)[1]
+    assert "too few steps to tell" in posterior_notes(few)[0]
+    assert "interrupted" in posterior_notes(few)[1]

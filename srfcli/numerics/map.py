@@ -519,7 +519,7 @@ def refine(task: TileTask, model: GeneratedModel, samples: Samples) -> Refined:
     cells = _grid_cells(task, samples, unit)
     while True:
         corners = points.index(cells.corners())
-        wanted = _suspects(points.samples.g[corners], cells.error)
+        wanted = suspects(points.samples.g[corners], cells.error)
         result.leaves.append(Cells(cells.at[~wanted], cells.size, cells.error[~wanted]))
         if not wanted.any():
             break
@@ -553,7 +553,7 @@ def _interpolation_error(g: Array, axis: int) -> Array:
     return np.moveaxis(np.concatenate([inner[:1], inner, inner[-1:]]), 0, axis)
 
 
-def _suspects(g: Array, error: Array) -> Array:
+def suspects(g: Array, error: Array) -> Array:
     """Return for cells with corner values `g` (C, 4) whether more could hide in them than their corners show."""
     usable = np.isfinite(g).all(axis=1)
     positive, size = g > 0, np.abs(np.where(np.isfinite(g), g, 0.0))

@@ -339,7 +339,7 @@ class FitResult(Result):
         unexplained = self.against or field or any(f.colours for f in fit.runs)  # else each step was where it was taken to be
         told = ("reset", "drive-smoothed", *(BETWEEN_SAMPLES if unexplained else ()))
         notes += told_of_runs(self.experiment.runs, told)
-        notes += [] if self.posterior is None else _posterior_notes(self.posterior)
+        notes += [] if self.posterior is None else posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
         if found.friction_field is not None:
             notes.append(str(found.friction_field))
@@ -491,7 +491,8 @@ def load_notes(fit: Fit) -> list[str]:
     return notes
 
 
-def _posterior_notes(posterior: Posterior) -> list[str]:
+def posterior_notes(posterior: Posterior) -> list[str]:
+    """Return what a reader of draws has to know: what they are worth, and whether they were cut short."""
     worth, worst = float(posterior.effective.min()), float(posterior.r_hat.max())
     count, chains = posterior.draws.shape[0], posterior.chains.shape[1]
     made = f"posterior: {count} draws of {chains} chains after {posterior.burn_in} steps of burn-in"
