@@ -373,6 +373,7 @@ def test_every_shipped_effect_is_here():
     [
         "1 - 0.5*v*phi/D0 - 0.25*(v*phi/D0)**3",  # a polynomial
         "2 - sqrt(v*phi/D0) - v*phi/D0",
+        "6 - sqrt(v*phi/D0) - v*phi/D0",  # at 4; its square has the root 9, too
         "2 - log(v*phi/D0) - 0.3*log(v*phi/D0)**2",
         "2 - v*phi/D0 - 0.3*log(v*phi/D0)",  # a Lambert function
         "2 - (v*phi/D0)**q - 0.3*(v*phi/D0)**(2*q)",

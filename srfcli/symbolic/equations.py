@@ -21,6 +21,7 @@ from srfcli.symbolic.system import System, state_rate
 AUXILIARY = {"slip": "v", "stage": "V", "time": "1"}  # unknowns that an effect may name, um, um, s, and their rates
 CHECKED_VELOCITIES = tuple(10.0**k for k in range(-3, 4))  # um/s, at which steady states are checked
 CHECKED_LOAD = 10.0  # N, the same
+ROOT_ERROR = 1e-6  # of a root as it is evaluated, relative; roots of a squared equation that are none are off by themselves
 MAX_CANCEL = 80  # operations: beyond it a common denominator takes a minute to find and shortens nothing
 
 
@@ -162,7 +163,8 @@ def _steady_roots(reduced: sp.Expr, y: sp.Symbol) -> Iterator[sp.Expr]:
     yield from (guess for guess in (sp.S.One, sp.S(2)) if sp.simplify(reduced.subs(y, guess)) == 0)
     with contextlib.suppress(NotImplementedError, TypeError):  # the latter where sympy compares symbols on its way
         if _may_be_solved(reduced, y):
-            yield from (r for r in sp.solve(reduced, y) if not r.has(sp.I))
+            found = sp.solve(reduced, y, check=False)  # checked in numbers, in half the time
+            yield from (r for r in found if r.is_positive is not False and not r.has(sp.I, sp.nan))
 
 
 def _regular(root: sp.Expr) -> sp.Expr:
@@ -175,19 +177,20 @@ def _regular(root: sp.Expr) -> sp.Expr:
 
 
 def _attracts(reduced: sp.Expr, y: sp.Symbol, root: sp.Expr, values: Mapping[sp.Symbol, float]) -> bool:
-    """Return whether a root is positive and the rate falls there, at one velocity at least; True where that is not known."""
+    """Return whether a root is one, and positive, and the rate falls there at one velocity at least; True if unknown."""
     slope, known = sp.diff(reduced, y), False
     for v in CHECKED_VELOCITIES:
         at = {**values, symbol("v"): v, symbol("W"): CHECKED_LOAD}
         try:
             place = complex(root.subs(at))
-            falls = complex(slope.subs(y, root).subs(at))
+            falls, left = (complex(e.subs({**at, y: place if place.imag else place.real})) for e in (slope, reduced))
         except (TypeError, ValueError, ArithmeticError):
             continue
-        if not np.isfinite([place, falls]).all():
+        if not np.isfinite([place, falls, left]).all():
             continue
         known = True
-        if place.real > 0 and abs(place.imag) <= 1e-9 * place.real and falls.real < 0:
+        real = place.real > 0 and abs(place.imag) <= 1e-9 * place.real
+        if real and falls.real < 0 and abs(left) <= ROOT_ERROR * abs(falls * place):
             return True
     return not known
 
