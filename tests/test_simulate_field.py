@@ -41,7 +41,7 @@ def test_covariance_over_many_seeds(length: float) -> None:
     knots = FrictionField(size, length).spacing
     x = np.concatenate([length * np.array([-1.5, -0.5, 0.0, 0.13, 0.5, 1.5, 2.5]), [10 * knots, 10.5 * knots]])
     low, high = float(x.min()), float(x.max())
-    values = np.array([FrictionField(size, length, seed).spline(low, high)(x) for seed in range(count)]) / size
+    values = np.array([curve(FrictionField(size, length, seed).spline(low, high))(x) for seed in range(count)]) / size
     expected = matern(x[:, None] - x[None, :], length)
     assert expected[1, 4] == pytest.approx(0.4834, abs=1e-4)  # at a distance of one length
     found = values.T @ values / count
@@ -155,7 +155,7 @@ def test_slow_sliding_follows_the_track(flags: tuple[str, ...], empty_folder: Pa
     base = ("--V", "1", "--W0", "3", "--for", "30", "--rate", "10", *flags)
     rough, smooth = columns(*base, "--field", "1e-3", "--field-length", "40", "--seed", "2"), columns(*base)
     slip = rough["t"] + rough["u"][0] - rough["u"]  # but for what the interface gives way
-    track = FrictionField(1e-3, 40.0, 2).spline(0.0, 60.0)
+    track = curve(FrictionField(1e-3, 40.0, 2).spline(0.0, 60.0))
     wander = rough["mu"] - smooth["mu"]
     assert np.ptp(wander) > 3e-4
     assert wander == pytest.approx(track(slip), abs=0.1 * np.ptp(wander))
@@ -185,7 +185,7 @@ def test_a_track_under_any_program(empty_folder: Path) -> None:
     rough = ("--field", "2e-3", "--field-length", "5")
     c = columns("--drive", "0.5:10, 3:0, 1:2->20", "--load", "1:5, 3:7", "--eps", "0.05", "--rate", "200", *rough)
     assert np.isfinite(c["mu"]).all()
-    here = FrictionField(2e-3, 5.0, 0).spline(0.0, 1.0)(np.array([0.0]))[0]
+    here = float(curve(FrictionField(2e-3, 5.0, 0).spline(0.0, 1.0))(0.0))
     smooth = columns("--V", "10", "--W0", "5", "--for", "0.1", "--start", "10")["mu"][0]
     for start in ("steady", "10", "v=10"):
         found = columns("--V", "10", "--W0", "5", "--for", "0.1", "--start", start, *rough)
