@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
+from test_splines import knots
 
 from srfcli.codegen.splines import Spline
 from srfcli.data.experiment import read_experiment
@@ -23,17 +24,12 @@ def test_prior_is_the_matern_covariance() -> None:
     np.testing.assert_allclose(L @ L.T, 9e-8 * (1 + d) * np.exp(-d), rtol=1e-6, atol=1e-14)
 
 
-def _design(track: Spline, x: np.ndarray) -> np.ndarray:
-    knots = track.first + track.spacing * (np.arange(track.coefficients.size + 4) - 3)
-    return BSpline.design_matrix(x, knots, 3).toarray()
-
-
 def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Spline]:
     """A linear problem r = J theta + C c + noise of variance 1 on a track; returns r, J, C and the track."""
     rng = np.random.default_rng(seed)
     track = Spline.over(0.0, 30.0, 0.8)
     n, m = 400, track.coefficients.size
-    J, C = rng.normal(size=(n, 2)), 2e4 * _design(track, np.linspace(0, 30, n))
+    J, C = rng.normal(size=(n, 2)), 2e4 * BSpline.design_matrix(np.linspace(0, 30, n), knots(track), 3).toarray()
     c = FieldPrior(amplitude, LENGTHS[1]).root(track.nodes) @ rng.normal(size=m) if amplitude else np.zeros(m)
     return J @ [1.0, -2.0] + C @ c + rng.normal(size=n), J, C, track
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import BSpline, PPoly
+from scipy.interpolate import PPoly
 from test_simulate_command import columns, read, simulate
+from test_splines import scipy_spline
 
 from srfcli.codegen.c_source import compiled, compiler
-from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError
 from srfcli.data.noise import FINEST_KNOTS, KNOTS, WIDEST_KNOTS, FrictionField
 from srfcli.laws.registry import load_registry
@@ -41,7 +41,7 @@ def test_covariance_over_many_seeds(length: float) -> None:
     knots = FrictionField(size, length).spacing
     x = np.concatenate([length * np.array([-1.5, -0.5, 0.0, 0.13, 0.5, 1.5, 2.5]), [10 * knots, 10.5 * knots]])
     low, high = float(x.min()), float(x.max())
-    values = np.array([curve(FrictionField(size, length, seed).spline(low, high))(x) for seed in range(count)]) / size
+    values = np.array([scipy_spline(FrictionField(size, length, seed).spline(low, high))(x) for seed in range(count)]) / size
     expected = matern(x[:, None] - x[None, :], length)
     assert expected[1, 4] == pytest.approx(0.4834, abs=1e-4)  # at a distance of one length
     found = values.T @ values / count
@@ -51,15 +51,10 @@ def test_covariance_over_many_seeds(length: float) -> None:
     assert np.abs(np.sqrt(np.diag(found)) - 1).max() < 0.1
 
 
-def curve(spline: Spline) -> BSpline:
-    """Return a table as scipy evaluates it."""
-    return BSpline(spline.first + spline.spacing * np.arange(-3, spline.coefficients.size + 1), spline.coefficients, 3)
-
-
 def test_what_lies_between_knots_is_as_rough_as_it_should_be() -> None:
     """Variance, correlation at the length and mean square slope along one long track, at knots and halfway between them."""
     track = FrictionField(1.0, 4.0, 5)
-    spline, h = curve(track.spline(0.0, 60_000.0)), track.spacing
+    spline, h = scipy_spline(track.spline(0.0, 60_000.0)), track.spacing
     x = np.arange(120_000) * h
     at, halfway, lag = spline(x), spline(x + h / 2), round(4.0 / h)
     assert halfway.var() == pytest.approx(at.var(), rel=2e-3)
@@ -115,7 +110,7 @@ class Given(Track):
 
     def profile(self, longest: float) -> Any:
         spline = FrictionField(self.size, self.length, self.seed).spline(0.0, longest + 1.0)
-        pieces = PPoly.from_spline(curve(spline))
+        pieces = PPoly.from_spline(scipy_spline(spline))
         breaks, coefficients = pieces.x[3:-3], pieces.c[:, 3:-3].T.tolist()
         first, step, last = float(breaks[0]), spline.spacing, len(coefficients) - 1
 
@@ -155,7 +150,7 @@ def test_slow_sliding_follows_the_track(flags: tuple[str, ...], empty_folder: Pa
     base = ("--V", "1", "--W0", "3", "--for", "30", "--rate", "10", *flags)
     rough, smooth = columns(*base, "--field", "1e-3", "--field-length", "40", "--seed", "2"), columns(*base)
     slip = rough["t"] + rough["u"][0] - rough["u"]  # but for what the interface gives way
-    track = curve(FrictionField(1e-3, 40.0, 2).spline(0.0, 60.0))
+    track = scipy_spline(FrictionField(1e-3, 40.0, 2).spline(0.0, 60.0))
     wander = rough["mu"] - smooth["mu"]
     assert np.ptp(wander) > 3e-4
     assert wander == pytest.approx(track(slip), abs=0.1 * np.ptp(wander))
@@ -185,7 +180,7 @@ def test_a_track_under_any_program(empty_folder: Path) -> None:
     rough = ("--field", "2e-3", "--field-length", "5")
     c = columns("--drive", "0.5:10, 3:0, 1:2->20", "--load", "1:5, 3:7", "--eps", "0.05", "--rate", "200", *rough)
     assert np.isfinite(c["mu"]).all()
-    here = float(curve(FrictionField(2e-3, 5.0, 0).spline(0.0, 1.0))(0.0))
+    here = float(scipy_spline(FrictionField(2e-3, 5.0, 0).spline(0.0, 1.0))(0.0))
     smooth = columns("--V", "10", "--W0", "5", "--for", "0.1", "--start", "10")["mu"][0]
     for start in ("steady", "10", "v=10"):
         found = columns("--V", "10", "--W0", "5", "--for", "0.1", "--start", start, *rough)

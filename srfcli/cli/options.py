@@ -132,8 +132,6 @@ def _numbers(name: str, parts: Sequence[str], text: str) -> tuple[tuple[float, .
             pairs.append(split_quantity(part, name=name))
         except SrfError as error:
             raise SrfError(f"--over {text!r}: {part.strip()!r} is not a number", AXIS_FORM) from error
-        if pairs[-1][1][:1] in ("-", "+"):
-            raise SrfError(f"--over {text!r}: {part.strip()!r} is not a number", AXIS_FORM)
     units = sorted({unit for _, unit in pairs if unit})
     if len(units) > 1:
         hint = "Write the unit once, after the last number."

@@ -10,6 +10,7 @@ from enum import Enum
 from typing import Any
 
 LONGEST_MESSAGE = 2000  # characters of a message
+CHECK_PATH = "Check path and permissions."
 # control characters but tab and newline, DEL and the second set, marks that are not seen or turn the line round, lone
 # surrogates (bytes of file names that are no text): what a terminal acts on, or shows as something else than it is
 _UNSEEN = re.compile(

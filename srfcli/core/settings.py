@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from srfcli.core.errors import SrfError, did_you_mean, shown
+from srfcli.core.errors import CHECK_PATH, SrfError, did_you_mean, shown
 from srfcli.core.files import parse_toml, read_text
 from srfcli.core.units import parse_quantity, to_base
 
@@ -111,7 +111,7 @@ def load_toml(path: Path | None) -> TomlSettings:
     except SrfError as error:
         raise SrfError(error.message, error.hint or 'A setting looks like K = "0.21 N/um" below [parameters].') from error
     except OSError as error:
-        raise SrfError(f"{path} cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1) from error
+        raise SrfError(f"{path} cannot be read: {error.strerror}", CHECK_PATH, exit_code=1) from error
     _refuse_unknown(data, {"parameters", "defaults"}, f"table in {path}")
     tables = {name: data.get(name, {}) for name in ("parameters", "defaults")}
     for name, table in tables.items():

@@ -109,7 +109,7 @@ def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float
     if len(text) > LONGEST_QUANTITY:
         raise SrfError(f"{name}: {len(text)} characters are no number", f"Write it as in {name}='{example}'.")
     match = _NUMBER.fullmatch(text)
-    if not match:
+    if not match or match[2][:1] in ("-", "+"):  # no unit begins with a sign
         raise SrfError(f"{name} = {text!r} is not a number", f"Write a number and, if you like, its unit: {name}='{example}'.")
     if re.match(r",\d", match[2]):
         raise SrfError(f"{name} = {text!r}: a decimal comma is not understood", f"Write a point: {text.replace(',', '.')}.")
@@ -155,9 +155,10 @@ def unit_factor(written: str, unit: str, geometry: Geometry = NO_GEOMETRY, *, wh
         elif gap == (1, 0, 0, 0) and (found.powers[2] == 0 or wanted.powers == (-1, 0, 1, 0)):  # a strain for a length
             if geometry.thickness:  # a stress per strain is a stiffness
                 return ratio * (SQUARE_MILLIMETRE / geometry.thickness if found.powers[2] else geometry.thickness)
-            hint = f'A strain needs the layer\'s thickness, from which {unit} follow: [apparatus] thickness = "4 mm"'
+            strain = "stress per strain" if found.powers[2] else "strain"
+            hint = f'A {strain} needs the layer\'s thickness, from which {unit} follow: [apparatus] thickness = "4 mm"'
             if found.powers[2]:
-                hint = f"A stiffness is a stress over a length, as in '30 MPa/mm'. {hint.replace('strain', 'stress per strain')}"
+                hint = f"A stiffness is a stress over a length, as in '30 MPa/mm'. {hint}"
             kind = "unit"
     prefix = f"{where}: " if where else ""
     said = f"{prefix}{written!r} measures {describe(found.powers)}, not {describe(wanted.powers)}"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import Notice, SrfError, did_you_mean
+from srfcli.core.errors import CHECK_PATH, Notice, SrfError, did_you_mean
 from srfcli.core.files import open_plain
 from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, split_heading
 from srfcli.data.clock import Mask, Place
@@ -81,7 +81,7 @@ def _passes(test: Callable[[bytes], bool], head: bytes) -> bool:
 
 
 def _unreadable(path: Path, error: OSError) -> SrfError:
-    return SrfError(f"{path}: cannot be read: {error.strerror or error}", "Check path and permissions.", exit_code=1)
+    return SrfError(f"{path}: cannot be read: {error.strerror or error}", CHECK_PATH, exit_code=1)
 
 
 @contextlib.contextmanager
@@ -303,7 +303,7 @@ def _needed(run: RunDescription, finder: Finder) -> list[Channel]:
     beside = [c.role for c in observables if c.column not in {one.column for one in seen}]
     if beside:
         others = ", ".join(beside)
-        every = ", ".join(f'"{c.role}"' for c in observables)
+        every = ", ".join(f'"{role}"' for role in (seen[0].role, *beside))
         what = f"{seen[0].role} is what is compared; the file also has {others}, left aside (observables = [{every}] takes all)"
         finder.notices.append(Notice("observable", str(run.file), what))
     moves = finder.find("load_point_velocity")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.errors import CHECK_PATH, SrfError, did_you_mean
 from srfcli.core.files import check_plain, parse_toml, read_text, recover
 from srfcli.core.toml import Node
 from srfcli.core.units import (
@@ -165,7 +165,7 @@ def open_node(path: Path) -> Node:
     try:
         text = read_text(path, limit=LARGEST_DESCRIPTION).replace("\r\n", "\n")
     except OSError as error:
-        raise SrfError(f"{path}: cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1) from None
+        raise SrfError(f"{path}: cannot be read: {error.strerror}", CHECK_PATH, exit_code=1) from None
     try:
         table = parse_toml(text, path)
     except SrfError as error:

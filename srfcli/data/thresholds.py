@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.errors import CHECK_PATH, SrfError, did_you_mean
 from srfcli.core.files import read_text
 from srfcli.core.units import find_unit, split_heading, tidy
 
@@ -66,7 +66,7 @@ def read_thresholds(path: Path) -> Thresholds:
     try:
         text = read_text(path, limit=LARGEST_TABLE, what="a table of critical loads")
     except OSError as error:
-        raise SrfError(f"{path} cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1) from error
+        raise SrfError(f"{path} cannot be read: {error.strerror}", CHECK_PATH, exit_code=1) from error
     numbered = enumerate(text.splitlines(), start=1)
     lines = [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
     if not lines:

@@ -15,7 +15,7 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from srfcli.core.errors import ExpressionError, SrfError, did_you_mean, shown
+from srfcli.core.errors import CHECK_PATH, ExpressionError, SrfError, did_you_mean, shown
 from srfcli.core.files import parse_toml, read_text
 from srfcli.core.settings import Parameter
 from srfcli.core.toml import Node
@@ -80,7 +80,7 @@ def open_law(path: Path) -> Node:
     except SrfError as error:
         raise SrfError(error.message, error.hint or 'Text goes in quotes: mu = "mu0 + A*log(v/V0)".') from None
     except OSError as error:
-        raise SrfError(f"{path}: cannot be read: {error.strerror}", "Check path and permissions.") from None
+        raise SrfError(f"{path}: cannot be read: {error.strerror}", CHECK_PATH) from None
 
 
 def read_header(path: Path) -> tuple[str, str, str]:

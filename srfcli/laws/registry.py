@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import Any
 
 from srfcli.core.cache import header_key, known_headers, user_base
-from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.errors import CHECK_PATH, SrfError, did_you_mean
 from srfcli.core.files import check_plain, open_plain, read_plain
 from srfcli.core.settings import Parameter
 from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, open_law, read_header, valid_name
@@ -31,7 +31,6 @@ from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, Law, Reader
 GROUP = "srf.laws"
 BUNDLED = "bundled"
 PLUGIN_SOURCES = ("--plugins", "SRF_PLUGINS")
-CHECK_PATH = "Check path and permissions."
 
 
 @dataclass(frozen=True)
