@@ -1,18 +1,16 @@
-"""The paper's printed equations and claims, held against what the model gives.
+"""Equations and claims that Cochard, Bureau and Baumberger, J. Appl. Mech. 70, 220 (2003), print, against what the model gives.
 
-Symbols as in symbolic/paper.toml: x_1 is x', x_3 is x''', coswt is cos(omega t).
+Lines are those of their manuscript's TeX source. x_1 is x', x_3 is x''' (of x, or of delta x in the linearised equations);
+coswt is cos(omega t); K_par is K || kappa.
 """
 
 from __future__ import annotations
 
-import functools
-import importlib.resources
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import sympy as sp
-import tomli
 
 from srfcli.core.units import to_base
 from srfcli.laws.expression import parse_expression, symbol
@@ -21,9 +19,26 @@ from srfcli.symbolic.derive import characteristic_polynomial, closed_limits, in_
 from srfcli.symbolic.equations import equations_of
 from srfcli.symbolic.system import System, build_system, state_rate
 
+SYMBOLS = (
+    "A", "B", "D0", "F", "K", "K_par", "M", "V", "V0", "Vsat", "W", "W0", "coswt", "delta_phi", "delta_x", "eps", "eta", "kappa",
+    "lambda", "mu", "mu0", "mu_phi", "mu_v", "phi", "t", "u", "v", "x", "x_1", "x_3", "xpl", "z",
+)  # fmt: skip
 VELOCITIES = (1.0, 100.0)  # um/s, the paper's range
 THRESHOLD = 1e-3
 REPEATABILITY = 0.03  # of the measured critical load
+
+
+@dataclass(frozen=True)
+class Equation:
+    """A printed equation; `form` derives what it should say, `times_i` marks a factor i that the formula leaves out."""
+
+    label: str
+    line: int
+    left: str
+    printed: str
+    form: Callable[[System], sp.Expr]
+    note: str = ""
+    times_i: bool = False
 
 
 @dataclass(frozen=True)
@@ -42,12 +57,6 @@ class Finding:
     note: str = ""
 
 
-@functools.cache
-def printed_statements() -> dict[str, list[dict[str, object]]]:
-    """Return the transcription: symbols, equations, claims and words."""
-    return tomli.loads(importlib.resources.files("srfcli").joinpath("symbolic/paper.toml").read_text(encoding="utf-8"))
-
-
 def paper_system() -> System:
     """Return the paper's model: its friction and ageing laws, kappa = W/lambda, vertical load, inertia."""
     return build_system(bundled_registry())
@@ -55,29 +64,22 @@ def paper_system() -> System:
 
 def check_paper() -> list[Finding]:
     """Return one finding for each printed equation, claim and wording, in this order."""
-    system, data = paper_system(), printed_statements()
-    found = [check_equation(system, e) for e in data["equation"]]
-    found += sorted((_check_claim(system, c) for c in data["claim"]), key=lambda f: f.line)
-    for w in data["words"]:
-        texts = _t(w, "printed"), _t(w, "right"), _t(w, "reason")
-        found.append(Finding("words", "in words", int(str(w["line"])), "misprint", *texts))
-    return found
+    system = paper_system()
+    found = [check_equation(system, e) for e in EQUATIONS]
+    for line, printed, check in CLAIMS:
+        verdict, right = check(system)
+        found.append(Finding("claim", "claim", line, verdict, printed, right))
+    return found + [Finding("words", "in words", line, "misprint", *texts) for line, *texts in WORDS]
 
 
-def _t(entry: dict[str, object], key: str) -> str:
-    return str(entry.get(key, ""))
-
-
-def check_equation(system: System, entry: dict[str, object]) -> Finding:
+def check_equation(system: System, equation: Equation) -> Finding:
     """Return whether a printed equation equals the derived one; `right` is the printed one with the fault mended."""
-    printed = parse_expression(_t(entry, "printed"), [str(n) for n in printed_statements()["symbols"]])
-    factor = sp.I if entry.get("times_i") else sp.S.One
-    right = FORMS[_t(entry, "form")](system)
+    printed, right = parse_expression(equation.printed, SYMBOLS), equation.form(system)
+    factor = sp.I if equation.times_i else sp.S.One
     verdict = "agrees" if _equal(factor * printed, right) else "misprint"
-    shown = _t(entry, "printed") if verdict == "agrees" else str(_like(right / factor, printed))
-    sign = "i*(" if factor == sp.I else ""
-    texts = [f"{_t(entry, 'left')} = {sign}{body}{')' if sign else ''}" for body in (_t(entry, "printed"), shown)]
-    return Finding("equation", _t(entry, "label"), int(str(entry["line"])), verdict, texts[0], texts[1], _t(entry, "note"))
+    shown = equation.printed if verdict == "agrees" else str(_like(right / factor, printed))
+    texts = [f"{equation.left} = {f'i*({body})' if equation.times_i else body}" for body in (equation.printed, shown)]
+    return Finding("equation", equation.label, equation.line, verdict, *texts, equation.note)
 
 
 def _equal(first: sp.Expr, second: sp.Expr) -> bool:
@@ -144,7 +146,7 @@ def _finite_stiffness(system: System) -> tuple[str, str]:
 
 
 def _strengthening_velocity(system: System) -> tuple[str, str]:
-    (at,) = sp.solve(FORMS["weakening"](system), symbol("V"))
+    (at,) = sp.solve(_weakening(system), symbol("V"))
     value = float(at.subs(_defaults(system)))
     Vsat = float(symbol("Vsat").subs(_defaults(system)))
     verdict = "holds" if abs(value / Vsat - 1) < 0.01 else "roughly"
@@ -188,7 +190,7 @@ def _estimate_small(system: System) -> tuple[str, str]:
     values = _defaults(system)
     values.pop(V)
     # every symbol of the estimate but V; mu_v is A for the paper's law
-    printed = in_law_parameters(system, FORMS["estimate"](system)).subs(values)
+    printed = in_law_parameters(system, _estimate(system)).subs(values)
     exact = exact_estimate(system).subs(values)
     c, c_exact = (float(e.subs(V, VELOCITIES[1])) for e in (printed, exact))
     up_to = max(float(r) for r in sp.Poly(printed - sp.Float(THRESHOLD), V).nroots() if r.is_real)
@@ -211,27 +213,7 @@ def _eta_small(system: System) -> tuple[str, str]:
     return verdict, f"K/kappa = {low:.2g} at onset at 1 um/s, {high:.2g} at 100 um/s"
 
 
-CLAIMS: dict[str, Callable[[System], tuple[str, str]]] = {
-    "finite_stiffness": _finite_stiffness,
-    "strengthening_velocity": _strengthening_velocity,
-    "inertia_midrange": _inertia_midrange,
-    "perturbation_parameter": _perturbation_parameter,
-    "frequency_real": _frequency_real,
-    "length_ratio": _length_ratio,
-    "estimate_small": _estimate_small,
-    "cubic_term": _cubic_term,
-    "eta_small": _eta_small,
-}
-
-
-def _check_claim(system: System, entry: dict[str, object]) -> Finding:
-    verdict, right = CLAIMS[_t(entry, "check")](system)
-    return Finding("claim", "claim", int(str(entry["line"])), verdict, _t(entry, "printed"), right)
-
-
 # What each printed equation of the paper should say, derived from the model: the law, the interface and Newton's equation.
-
-Form = Callable[[System], sp.Expr]
 
 
 def _s(names: str) -> tuple[sp.Symbol, ...]:
@@ -301,7 +283,7 @@ def _steady_position(system: System) -> sp.Expr:
     return sp.solve(_slider_force(system).subs(W0 * mu, F), x)[0]
 
 
-def _coefficient(k: int) -> Form:
+def _coefficient(k: int) -> Callable[[System], sp.Expr]:
     return lambda system: paper_coefficients(characteristic_polynomial(system))[k]
 
 
@@ -332,32 +314,68 @@ def _estimate(system: System) -> sp.Expr:
     return sp.cancel((c[4] * (V / D0) ** 4 / c[0]).subs(W0, kappa * D0))
 
 
-FORMS: dict[str, Form] = {
-    "friction": lambda system: system.friction.mu,
-    "ageing": lambda system: state_rate(system, system.friction.states[0]),
-    "stiffness": lambda system: system.interface.kappa,
-    "force": _force,
-    "interface_force": lambda system: symbol("W") * system.friction.mu,
-    "u_rate": lambda system: equations_of(system).rates[0],
-    "z_rate": _z_rate,
-    "v_rate": lambda system: symbol("v") * equations_of(system).rates[2],
-    "phi_rate": lambda system: symbol("phi") * equations_of(system).rates[3],
-    "steady_age": _steady_age,
-    "slip_velocity": slip_velocity,
-    "eta": eta,
-    "slider_force": _slider_force,
-    "steady_position": _steady_position,
-    "linear_force": _linear_force,
-    "linear_age": _linear_age,
-    **{f"C{k}": _coefficient(k) for k in range(5)},
-    "critical_stiffness": critical_stiffness,
-    "critical_frequency": critical_frequency,
-    "weakening": _weakening,
-    "estimate": _estimate,
-}
-
-
 def exact_estimate(system: System) -> sp.Expr:
     """Return C4 Omega_c^4/C0 at the exact Omega_c and W0c, in the law's parameters."""
     c = paper_coefficients(characteristic_polynomial(system))
     return in_law_parameters(system, c[4] * _closed(system)[3] ** 2 / c[0])
+
+
+# What the paper prints: its equations, numerical claims, and slips in words.
+
+EQUATIONS = (
+    Equation("eq:frico", 139, "mu(v, phi)", "mu0 + A*log(v/V0) + B*log(1 + Vsat*phi/D0)", lambda system: system.friction.mu),
+    Equation("eq:phidot", 146, "d phi/dt", "1 - v*phi/D0", lambda system: state_rate(system, system.friction.states[0])),
+    Equation("kappa", 407, "kappa", "W/lambda", lambda system: system.interface.kappa),
+    Equation("eq:newt", 412, "M x''", "K*(V*t - x) - kappa*(x - xpl)", _force),
+    Equation("eq:newt0", 420, "(W/lambda) (x - xpl)", "W*(mu0 + A*log(v/V0) + B*log(1 + Vsat*phi/D0))",
+             lambda system: symbol("W") * system.friction.mu),
+    Equation("eq:dotu", 454, "u'", "V - z", lambda system: equations_of(system).rates[0]),
+    Equation("eq:dotz", 456, "z'", "K/M*u - W0*(1 + eps*coswt)/M*(mu0 + A*log(v/V0) + B*log(1 + Vsat*phi/D0))", _z_rate),
+    Equation("eq:dotv", 460, "v'", "v/(lambda*A)*(z - v - lambda*B*Vsat*(1 - v*phi/D0)/(D0*(1 + Vsat*phi/D0)))",
+             lambda system: symbol("v") * equations_of(system).rates[2]),
+    Equation("phi' (below eq:dotv)", 463, "phi'", "1 - v*phi/D0", lambda system: symbol("phi") * equations_of(system).rates[3]),
+    Equation("steady sliding", 707, "phi", "D0/V", _steady_age),
+    Equation("eq:slipv", 726, "v", "x_1 + (M*x_3 - K*(V - x_1))/kappa", slip_velocity),
+    Equation("eta", 733, "eta", "(K + kappa)/kappa", eta),
+    Equation("eta, by the series stiffness K || kappa", 733, "eta", "K/K_par", eta,
+             "with K || kappa = K kappa/(K + kappa), the series stiffness; the parallel one, K + kappa, would not do"),
+    Equation("eq:rfd", 738, "M x''", "K*(V*t - x) - W0*mu", _slider_force),
+    Equation("steady position", 745, "x", "V*t - F/K", _steady_position),
+    Equation("eq:linsystem, first line", 756, "M delta x''",
+             "-K*delta_x - W0*((mu_v/V)*(eta*x_1 + M/kappa*x_3) + (mu_phi*V/D0)*delta_phi)", _linear_force),
+    Equation("eq:linsystem, second line", 761, "delta phi'", "-eta*x_1/V - M/K*x_3/V - delta_phi*V/D0", _linear_age),
+    Equation("eq:coefs, C0", 785, "C0", "K*V/D0", _coefficient(0)),
+    Equation("eq:coefs, C1", 786, "C1", "W0/D0*(K*D0/W0 - eta*(mu_phi - mu_v))", _coefficient(1), times_i=True),
+    Equation("eq:coefs, C2", 787, "C2", "-(M*V/D0 + eta*mu_v*W0/V)", _coefficient(2)),
+    Equation("eq:coefs, C3", 788, "C3", "-M*W0/(kappa*D0)*(kappa*D0/W0 + (mu_v - mu_phi))", _coefficient(3), times_i=True),
+    Equation("eq:coefs, C4", 790, "C4", "M*mu_v*W0/(kappa*V)", _coefficient(4)),
+    Equation("eq:kcinert", 806, "K D0/W0c", "(mu_phi - mu_v)*(1 + M*V**2/(W0*D0*mu_v))", critical_stiffness),
+    Equation("eq:pulsinert", 812, "D0 Omega_c/V", "sqrt((mu_phi - mu_v)/mu_v)", critical_frequency),
+    Equation("eq:weakslope", 822, "-d mu_ss/d ln V", "B/(1 + V/Vsat) - A", _weakening),
+    Equation("estimate of c", 831, "c", "mu_v*M*V**2/(K*D0**2)", _estimate),
+)  # fmt: skip
+CLAIMS = (
+    (481, "Vsat, above which mu_d(V) increases with increasing V", _strengthening_velocity),
+    (487, "at 10 um/s inertial terms can be neglected in eq:kcinert", _inertia_midrange),
+    (639, "mu0 eps_eff/A is already larger than 1 for eps_eff = 0.1", _perturbation_parameter),
+    (798, "Omega is purely imaginary at the Hopf bifurcation", _frequency_real),
+    (833, "W0/(kappa D0) = lambda/D0 is about 1", _length_ratio),
+    (834, "c < 1e-3 within the experimental velocity range", _estimate_small),
+    (838, "a finite kappa changes C3 by terms of order mu_v, mu_phi, about 1e-2", _cubic_term),
+    (843, "eta - 1 = K/kappa is about 1e-2", _eta_small),
+    (845, "massless, elastic interface: no practical effect on the critical parameters", _finite_stiffness),
+)
+WORDS = (  # printed, right, and why
+    (504, "(iv) for the determination of lambda", "(v)", "the item before it is (iv) already"),
+    (528, "two complex conjugate values of the fundamental matrix",
+     "two complex conjugate eigenvalues of the fundamental matrix over one period",
+     "multipliers are eigenvalues; a value is not defined"),
+    (558, "even ones corresponding to a transition from steading sliding to stick-slip", "from stick-slip to steady sliding",
+     "the odd ones are said to be that; as W0 rises, stability is lost and regained by turns"),
+    (616, "successive bifurcations from stick-slip to steady sliding then back to steady-sliding", "then back to stick-slip",
+     "a stability boundary that is crossed twice returns to where it began"),
+    (719, "the elongation of the loading spring is x-Vt", "Vt - x, which is u",
+     "the spring pulls with K (Vt - x), printed in eq:slipv and eq:rfd, and steady sliding stretches it by F/K"),
+    (730, "the equivalent stiffness of the loading spring in parallel with the interface", "in series with the interface",
+     "eta = K/(K || kappa) equals the printed (K + kappa)/kappa for K || kappa = K kappa/(K + kappa), the series stiffness"),
+)  # fmt: skip
