@@ -37,7 +37,7 @@ from srfcli.core.cache import LARGEST_ENTRY, cache_folder, content_key, is_seale
 from srfcli.core.errors import SrfError
 from srfcli.core.files import read_plain, write_atomic
 
-# Generated array functions as C: `x[..., i]` becomes `x[i]`, `out[..., i, j] = e` one assignment to a flat array.
+# Generated array functions as C: `out[..., i, j] = e` becomes one assignment to a flat array.
 
 _FUNCTIONS = {name: name for name in ("cos", "cosh", "exp", "expm1", "log", "log1p", "sin", "sinh", "sqrt", "tan", "tanh")}
 _FUNCTIONS |= {name: f"srf_{name}" for name in ("lut", "lut1", "lut2")}
@@ -60,46 +60,69 @@ _SLOPES = {  # of f at {a} where f({a}) = {v}
 }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Formulas:
+    """A function of a generated module, for one state.
+
+    The named `steps` follow one another; `entries` are those of the output that are not zero, by their place in it row by row.
+    The `shape` of a number is ().
+    """
+
+    arguments: tuple[str, ...]
+    steps: tuple[tuple[str, ast.expr], ...]
+    entries: dict[int, ast.expr]
+    shape: tuple[int, ...]
+
+
+def formulas_of(source: str, name: str) -> Formulas:
+    """Return what function `name` of a generated module computes, `x[..., i]` written as `x[i]`; SrfError where there is none."""
+    function = _functions(source).get(name)
+    if function is None:
+        raise SrfError(f"generated module has no function '{name}'")
+    steps: list[tuple[str, ast.expr]] = []
+    entries: dict[int, ast.expr] = {}
+    shape: tuple[int, ...] = ()
+    for statement in function.body:
+        match statement:
+            case ast.Return(value=ast.BinOp(right=number)):  # _empty(...) + it
+                entries[0] = number
+            case ast.Assign(targets=[ast.Name(id="out")], value=ast.Call(args=[_, trailing])):
+                shape = ast.literal_eval(trailing)
+            case ast.Assign(targets=[ast.Subscript(slice=index)], value=value):
+                place = ast.literal_eval(index)
+                entries[place if len(shape) == 1 else place[0] * shape[1] + place[1]] = value
+            case ast.Assign(targets=[ast.Name(id=step)], value=value):
+                steps.append((step, value))
+    return Formulas(tuple(a.arg for a in function.args.args), tuple(steps), entries, shape)
+
+
+@lru_cache(maxsize=4)
+def _functions(source: str) -> dict[str, ast.FunctionDef]:
+    """Return the functions of a generated module, parsed once: dozens are asked for."""
+    return {d.name: d for d in ast.parse(source.replace("[..., ", "[")).body if isinstance(d, ast.FunctionDef)}
+
+
 def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str:
     """Return function `name` of the generated module `source` as `MODEL void label(..., out)`, its arguments as they are.
 
     In dual numbers x, p and out are such. Entries of `out` that the formulas leave at zero are not written: the caller clears it.
     Raises SrfError for no such function.
     """
-    function = _functions(source).get(name)
-    if function is None:
-        raise SrfError(f"generated module has no function '{name}'")
-    arguments = [a.arg for a in function.args.args]
+    function = formulas_of(source, name)
     slopes = _Slopes() if dual else None
-    lines, shape = [], (1,)
-    for statement in function.body[1:]:  # the first is the docstring
-        if isinstance(statement, ast.Return):
-            if isinstance(statement.value, ast.BinOp):  # of one number: _empty(...) + it
-                lines += _stored(0, statement.value.right, slopes)
-            continue
-        assert isinstance(statement, ast.Assign)
-        target, value = statement.targets[0], statement.value
-        if isinstance(target, ast.Subscript):
-            lines += _stored(_flat(target, shape), value, slopes)
-        elif isinstance(target, ast.Name) and target.id == "out":
-            assert isinstance(value, ast.Call)
-            shape = ast.literal_eval(value.args[1])
-        elif isinstance(target, ast.Name):
-            if slopes is None or not slopes.moves(value):
-                lines.append(f"const double {_safe(target.id)} = {_text(value)};")
-            else:
-                lines += slopes.named(target.id, value)
-    unused = "".join(f" (void){_safe(a)};" for a in arguments)
+    lines = []
+    for step, value in function.steps:
+        if slopes is None or not slopes.moves(value):
+            lines.append(f"const double {_safe(step)} = {_text(value)};")
+        else:
+            lines += slopes.named(step, value)
+    for place, value in function.entries.items():
+        lines += _stored(place, value, slopes)
+    unused = "".join(f" (void){_safe(a)};" for a in function.arguments)
     kinds = {a: "const dual *" if dual else "const double *" for a in _POINTERS}
-    declared = ", ".join(f"{kinds.get(a, 'const double ')}{_safe(a)}" for a in arguments)
+    declared = ", ".join(f"{kinds.get(a, 'const double ')}{_safe(a)}" for a in function.arguments)
     body = "\n".join(f"    {line}" for line in lines)
     return f"MODEL void {label}({declared}, {'dual' if dual else 'double'} *out) {{\n   {unused}\n{body}\n}}\n"
-
-
-@lru_cache(maxsize=4)
-def _functions(source: str) -> dict[str, ast.FunctionDef]:
-    """Return the functions of a generated module, parsed once: dozens are asked for."""
-    return {d.name: d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef)}
 
 
 def _stored(place: int, node: ast.AST, slopes: _Slopes | None) -> list[str]:
@@ -230,13 +253,6 @@ class _Slopes:
         return self._let(f"{by} * {factor}") if by != "1.0" else factor if factor.isidentifier() else self._let(factor)
 
 
-def _flat(target: ast.Subscript, shape: tuple[int, ...]) -> int:
-    """Return the place in a flat array that out[..., i] or out[..., i, j] names."""
-    assert isinstance(target.slice, ast.Tuple)
-    places = [ast.literal_eval(e) for e in target.slice.elts[1:]]
-    return places[0] if len(places) == 1 else places[0] * shape[1] + places[1]
-
-
 def _safe(name: str) -> str:
     """Return a name that no keyword or macro of C shadows."""
     return name if name in _POINTERS else f"q_{name}"
@@ -250,8 +266,6 @@ def _text(node: ast.AST) -> str:
         case ast.Name(id=name):
             return _PI if name == "pi" else _safe(name)
         case ast.Subscript(value=ast.Name(id=name), slice=ast.Constant(value=int() as index)):
-            return f"{name}[{index}]"
-        case ast.Subscript(value=ast.Name(id=name), slice=ast.Tuple(elts=[*_, ast.Constant(value=int() as index)])):
             return f"{name}[{index}]"
         case ast.UnaryOp(op=ast.USub(), operand=operand):
             return f"(-{_text(operand)})"

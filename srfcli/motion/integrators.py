@@ -3,9 +3,8 @@
 The sensitivities S solve S' = f_x S + f_p. The compiled integrator differentiates its own discrete solution, so that a gradient
 is that of the very number which is returned. LSODA carries S along as further unknowns.
 
-LSODA calls functions of one state in Python floats. They are made from the text of the generated module: `x[..., i]` becomes
-`x[i]`, `out[..., i] = e` becomes an entry of a tuple, and what depends on the parameters alone is computed once, when they are
-bound.
+LSODA calls functions of one state in Python floats. They are made from the text of the generated module: `out[..., i] = e`
+becomes an entry of a tuple, and what depends on the parameters alone is computed once, when they are bound.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.codegen.c_source import compiled
+from srfcli.codegen.c_source import compiled, formulas_of
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.codegen.splines import Spline, appended, tables_after
 from srfcli.core.errors import SrfError, Status
@@ -166,18 +165,12 @@ def rtol_of_estimate(rtol: float) -> float:
 
 def doubles(array: Array) -> ctypes.c_void_p:
     """Return a pointer to the array, or to a contiguous copy of doubles where it is none of these."""
-    return _pointer(np.ascontiguousarray(array, dtype=float))
+    return np.ascontiguousarray(array, dtype=float).ctypes.data_as(ctypes.c_void_p)  # which keeps it alive
 
 
 def integers(array: NDArray[Any]) -> ctypes.c_void_p:
     """Return a pointer to the array, or to a contiguous copy of C's ints where it is none of these."""
-    return _pointer(np.ascontiguousarray(array, dtype=np.intc))
-
-
-def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:
-    pointer = ctypes.c_void_p(array.ctypes.data)
-    pointer.array = array  # type: ignore[attr-defined]  # keeps it alive through the call
-    return pointer
+    return np.ascontiguousarray(array, dtype=np.intc).ctypes.data_as(ctypes.c_void_p)
 
 
 def integrate_lsoda(
@@ -312,57 +305,25 @@ def _lambertw(x: float) -> float:
 
 def scalar_source(source: str, name: str) -> str:
     """Return the text of `bind(p)`, which returns the scalar form of function `name` of a generated module."""
-    function = next((d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef) and d.name == name), None)
-    if function is None:
-        raise SrfError(f"generated module has no function '{name}'")
+    function = formulas_of(source, name)
     once: list[str] = []
     inside: list[str] = []
-    cells: dict[Any, str] = {}
-    shape: tuple[int, ...] = ()
-    fixed = set(_MATH) | set(_ALIASES) | {"lambertw", "p"}
-    result = ""
-    for statement in function.body[1:]:  # the first is the docstring
-        statement = _OneState().visit(statement)
-        if isinstance(statement, ast.Return):
-            result = _returned(statement, cells, shape)
-            continue
-        assert isinstance(statement, ast.Assign)
-        target, value = statement.targets[0], statement.value
-        if isinstance(target, ast.Subscript):
-            cells[ast.literal_eval(target.slice)] = ast.unparse(value)
-        elif isinstance(target, ast.Name) and target.id == "out":
-            assert isinstance(value, ast.Call)
-            shape = ast.literal_eval(value.args[1])
-        elif isinstance(target, ast.Name):
-            constant = all(n.id in fixed for n in ast.walk(value) if isinstance(n, ast.Name))
-            (once if constant else inside).append(ast.unparse(statement))
-            if constant:
-                fixed.add(target.id)
-    arguments = ", ".join(a.arg for a in function.args.args if a.arg != "p")
-    lines = [*once, f"def {name}({arguments}):", *(f"    {line}" for line in inside), f"    return {result}", f"return {name}"]
+    fixed = {*_MATH, *_ALIASES, "lambertw", "p"}
+    for step, value in function.steps:
+        constant = all(n.id in fixed for n in ast.walk(value) if isinstance(n, ast.Name))
+        (once if constant else inside).append(f"{step} = {ast.unparse(value)}")
+        if constant:
+            fixed.add(step)
+    found = {place: ast.unparse(value) for place, value in function.entries.items()}
+    entries = [found.get(place, "0.0") for place in range(math.prod(function.shape))]
+    for width in function.shape[::-1]:  # the rows of a matrix, then the tuple of these; a number stays one
+        entries = [f"({', '.join(entries[a : a + width])},)" for a in range(0, len(entries), width)]
+    arguments = ", ".join(a for a in function.arguments if a != "p")
+    lines = [
+        *once,
+        f"def {name}({arguments}):",
+        *(f"    {line}" for line in inside),
+        f"    return {entries[0]}",
+        f"return {name}",
+    ]
     return "def bind(p):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
-
-
-def _returned(statement: ast.Return, cells: dict[Any, str], shape: tuple[int, ...]) -> str:
-    value = statement.value
-    if isinstance(value, ast.BinOp):  # _empty(...) + expression: only arrays need the first term
-        return ast.unparse(value.right)
-    if len(shape) == 1:
-        return _tuple([cells.get(i, "0.0") for i in range(shape[0])])
-    return _tuple([_tuple([cells.get((i, j), "0.0") for j in range(shape[1])]) for i in range(shape[0])])
-
-
-def _tuple(entries: list[str]) -> str:
-    return f"({', '.join(entries)},)"
-
-
-class _OneState(ast.NodeTransformer):
-    """Removes the ellipsis from every index: a[..., i, j] becomes a[i, j]."""
-
-    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
-        self.generic_visit(node)
-        index = node.slice
-        if isinstance(index, ast.Tuple) and isinstance(index.elts[0], ast.Constant) and index.elts[0].value is Ellipsis:
-            rest = index.elts[1:]
-            node.slice = rest[0] if len(rest) == 1 else ast.Tuple(rest, ast.Load())
-        return node
