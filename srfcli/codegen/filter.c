@@ -37,9 +37,7 @@ typedef struct {
     const int *order;                       /* how many states each of these has */
     double rtol, longest, h;                /* h: the step that the last one suggests */
     const double *atol;
-    double Z[NZ], before;                   /* increments and length of the last step, 0 for none */
-    double last_error, last_h;
-    int first;
+    Control control;
     StageMatrix matrix;                     /* of the last step */
     long steps, rejected, max_steps;
     const volatile int *stop;
@@ -260,8 +258,9 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
 
 /* carries the belief from a to b, between which all that is imposed is smooth; returns 0 where it stops early */
 static NOINLINE int advance(Imposed *force, Course *course, Belief *belief, double a, double b) {
-    double V, W, W_dot, Z[NZ], Z0[NZ], J0[NX * NX], f0[NX], carry = 0.0;
-    int rejected = 0, unseen = 0, first = course->first;
+    Control *control = &course->control;
+    double Z[NZ], J0[NX * NX], f0[NX], carry = 0.0;
+    int unseen = 0;
     const long begun = course->steps + course->rejected;
     Node now;
     now.t = a;
@@ -269,9 +268,7 @@ static NOINLINE int advance(Imposed *force, Course *course, Belief *belief, doub
         long taken = course->steps + course->rejected - begun;
         if (taken > MANY && (now.t - a) * course->max_steps < (b - a) * taken) return 0; /* at this pace it never gets there */
         memcpy(now.x, belief->x, sizeof now.x);
-        imposed(force, now.t, &V, &W, &W_dot);
-        memset(now.f, 0, sizeof now.f);
-        srf_rates(now.x, V, W, W_dot, course->p, now.f);
+        rates_at(force, now.t, now.x, now.f);
         memcpy(f0, now.f, sizeof f0);
         if (!finite_all(f0, NX)) return 0;
         if (!(course->h > 0.0)) course->h = fmin(first_step(force, &now, b - a, course->rtol, course->atol), course->longest);
@@ -280,44 +277,26 @@ static NOINLINE int advance(Imposed *force, Course *course, Belief *belief, doub
             double h = course->h;
             int final = fitted(&h, b - now.t);
             if (h < 4.0 * DBL_EPSILON * fmax(fabs(now.t), fabs(b)) && !final && ++unseen > MAX_UNSEEN) return 0;
-            if (course->before > 0.0) predict(course->Z, course->before, h, Z0);
-            else memset(Z0, 0, sizeof Z0);
-            int newton = stages(force, &now, h, Z0, course->rtol, course->atol, Z, &course->matrix);
-            if (!newton && course->before > 0.0) {
-                memset(Z0, 0, sizeof Z0);
-                newton = stages(force, &now, h, Z0, course->rtol, course->atol, Z, &course->matrix);
-            }
+            int newton = attempt(force, &now, h, control, 0, course->rtol, course->atol, Z, &course->matrix);
+            int first = control->last_h == 0.0, rejected = control->rejected;
             double error = INFINITY;
             if (newton) {
-                imposed(force, now.t, &V, &W, &W_dot);
-                memset(J0, 0, sizeof J0);
-                srf_jacobian(now.x, V, W, W_dot, course->p, J0);
+                jacobian_at(force, now.t, now.x, J0);
                 error = estimate(force, &now, f0, h, Z, J0, course->rtol, course->atol, first || rejected);
                 if (error < 1.0) error = fmax(error, moments(force, course, belief, now.t, h, Z));
             }
-            double safety = 0.9 * (2 * MAX_NEWTON + 1.0) / (2 * MAX_NEWTON + (newton ? newton : MAX_NEWTON));
-            double factor_ = isfinite(error) ? fmin(8.0, fmax(0.2, safety * pow(error, -0.25))) : 0.25;
+            double next = next_length(control, h, error, newton);
             if (!(error < 1.0)) {
                 course->rejected++;
-                course->h = h * (rejected || isinf(error) ? fmin(factor_, 0.5) : fmin(factor_, 0.9));
-                rejected = 1;
+                course->h = next;
                 if (course->h < 1e-300 || !finite_all(belief->x, NX)) return 0;
                 continue;
             }
-            double after = time_after(now.t, h, b, final, &carry);
-            if (!first && course->last_h > 0.0) { /* predictive controller of Gustafsson */
-                double predicted = safety * (h / course->last_h) * pow(error * error / course->last_error, -0.25);
-                factor_ = fmin(factor_, fmax(0.2, fmin(8.0, predicted)));
-            }
-            course->last_error = fmax(error, 1e-2);
-            course->last_h = h;
-            if (rejected) factor_ = fmin(factor_, 1.0);
-            course->h = fmin(fmax(h * factor_, final && !rejected ? fmin(course->h, 8.0 * h) : 0.0), course->longest);
-            memcpy(course->Z, Z, sizeof Z);
-            course->before = h;
+            course->h = fmin(fmax(next, final && !rejected ? fmin(course->h, 8.0 * h) : 0.0), course->longest);
+            memcpy(control->Z, Z, sizeof Z);
+            control->before = h;
             course->steps++;
-            course->first = first = rejected = 0;
-            now.t = after;
+            now.t = time_after(now.t, h, b, final, &carry);
             break;
         }
     }
@@ -435,7 +414,7 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
     double values[NP];
     dual q[NP], colour[3 * GAUGE_PROCESSES * SIGNALS], y[NX], one, g[NX], bound[NX];
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values};
-    Course course = {values, q, slopes, keep, ng, NX, order, rtol, 0.0, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
+    Course course = {values, q, slopes, keep, ng, NX, order, rtol, 0.0, 0.0, atol, {{0.0}, 0.0, 0.0, 0.0, 0}, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
     Belief b;
     int na, segment_ = -1, filled = 0, bounded = 0, begins[NA] = {0}; /* 1 + the signal of the process whose first state this is */
     double now = t[0], last = t[0];
@@ -463,9 +442,7 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
                 force.acceleration = drive[3 * segment_ + 1];
                 force.since = drive[3 * segment_ + 2];
                 course.longest = longest[segment_];
-                course.before = 0.0;
-                course.h = 0.0;
-                course.first = 1;
+                course.control.before = course.control.last_h = course.h = 0.0;
                 continue;
             }
             double to = segment_ + 1 < n_segments ? fmin(t[k], edges[segment_ + 1]) : t[k];

@@ -299,13 +299,11 @@ static double estimate_sensitivities(const History *q, double h, const double *J
 /* how long a step Radau IIA would make from a node, tried with h; 0 where Newton's method fails */
 static double implicit_reach(Imposed *force, const Node *from, double h, double rtol, const double *atol) {
     StageMatrix matrix;
-    double V, W, W_dot, Z[NZ], Z0[NZ], J0[NX * NX];
+    double Z[NZ], Z0[NZ], J0[NX * NX];
     memset(Z0, 0, sizeof Z0);
     matrix.h = 0.0;
     if (!(h > 0.0) || !stages(force, from, h, Z0, rtol, atol, Z, &matrix)) return 0.0;
-    imposed(force, from->t, &V, &W, &W_dot);
-    memset(J0, 0, sizeof J0);
-    srf_jacobian(from->x, V, W, W_dot, force->p, J0);
+    jacobian_at(force, from->t, from->x, J0);
     double error = fmax(estimate(force, from, from->f, h, Z, J0, rtol, atol, 1), between(from, h, Z, rtol, atol));
     return h * fmin(8.0, 0.9 * pow(error, -0.25));
 }
@@ -315,22 +313,18 @@ static int explicit_steps(Imposed *force, History *q, double b, double rtol, con
 /* integrates one smooth segment [a, b], explicitly as far as it is not stiff; returns the next output index, or -1 - (it) where it stopped early */
 static NOINLINE int segment(Imposed *force, History *q, double a, double b, double rtol, const double *atol, double longest, long max_steps, int next, int nt, const double *t, double *X, double *S, double *stats, const volatile int *stop) {
     StageMatrix matrix;
-    double V, W, W_dot, Z[NZ], Z0[NZ], J0[NX * NX], f0[NX], before = 0.0, last_error = 1.0, last_h = 0.0;
-    double carry = 0.0;
-    int rejected = 0, first = 1, unseen = 0, handed = 0;
+    Control control = {{0.0}, 0.0, 0.0, 0.0, 0};
+    double Z[NZ], J0[NX * NX], f0[NX], carry = 0.0;
+    int unseen = 0, handed = 0;
     Node *now = &q->node[0];
     now->t = a;
-    imposed(force, a, &V, &W, &W_dot);
-    memset(now->f, 0, sizeof now->f);
-    srf_rates(now->x, V, W, W_dot, force->p, now->f);
+    rates_at(force, a, now->x, now->f);
     q->nodes = 1;
     if (!q->ns || q->explicit_work) {
         next = explicit_steps(force, q, b, rtol, atol, longest, max_steps, next, nt, t, X, S, stats, stop);
         if (next < 0 || now->t >= b) return next;
         handed = now->t > a;
-        imposed(force, now->t, &V, &W, &W_dot);
-        memset(now->f, 0, sizeof now->f);
-        srf_rates(now->x, V, W, W_dot, force->p, now->f);
+        rates_at(force, now->t, now->x, now->f);
     }
     memcpy(f0, now->f, sizeof f0);
     sensitivity_rates(q, 0, force);
@@ -342,23 +336,11 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
         /* A slider that stops passes through many decades of v in less time than t can tell apart: t is summed with its carry,
            and the steps may be as small as they like, though not for ever. */
         if (h < 4.0 * DBL_EPSILON * fmax(fabs(now->t), fabs(b)) && !final && ++unseen > MAX_UNSEEN) return -1 - next;
-        if (before > 0.0) predict(Z, before, h, Z0);
-        else memset(Z0, 0, sizeof Z0);
-        double kept[NZ];
-        memcpy(kept, Z, before > 0.0 ? sizeof kept : 0);
-        matrix.h = 0.0;
-        int newton = stages(force, now, h, Z0, rtol, atol, Z, &matrix);
-        if (!newton && before > 0.0) {
-            memset(Z0, 0, sizeof Z0);
-            matrix.h = 0.0;
-            newton = stages(force, now, h, Z0, rtol, atol, Z, &matrix);
-        }
+        int newton = attempt(force, now, h, &control, 1, rtol, atol, Z, &matrix), first = control.last_h == 0.0;
         double error = INFINITY;
         if (newton) {
-            imposed(force, now->t, &V, &W, &W_dot);
-            memset(J0, 0, sizeof J0);
-            srf_jacobian(now->x, V, W, W_dot, force->p, J0);
-            error = estimate(force, now, f0, h, Z, J0, rtol, atol, first || rejected);
+            jacobian_at(force, now->t, now->x, J0);
+            error = estimate(force, now, f0, h, Z, J0, rtol, atol, first || control.rejected);
             if (!first) error = fmax(error, between(now, h, Z, rtol, atol));
             if (error < 1.0 && q->ns) {
                 double other = step_sensitivities(q, force, now, h, Z) ? estimate_sensitivities(q, h, J0, rtol, atol) : INFINITY;
@@ -366,13 +348,9 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
             }
         }
         stats[2] += newton ? newton : MAX_NEWTON;
-        double safety = 0.9 * (2 * MAX_NEWTON + 1.0) / (2 * MAX_NEWTON + (newton ? newton : MAX_NEWTON));
-        double factor_ = isfinite(error) ? fmin(8.0, fmax(0.2, safety * pow(error, -0.25))) : 0.25;
         if (!(error < 1.0)) {
             stats[1] += 1;
-            memcpy(Z, kept, before > 0.0 ? sizeof kept : 0);
-            h *= rejected || isinf(error) ? fmin(factor_, 0.5) : fmin(factor_, 0.9);
-            rejected = 1;
+            h = next_length(&control, h, error, newton);
             if (h < 1e-300) return -1 - next;
             continue;
         }
@@ -380,17 +358,15 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
         after.t = time_after(now->t, h, b, final, &carry);
         for (int r = 0; r < NX; r++) after.x[r] = now->x[r] + Z[2 * NX + r];
         double f_after[NX];
-        memset(f_after, 0, sizeof f_after);
-        imposed(force, after.t, &V, &W, &W_dot);
-        srf_rates(after.x, V, W, W_dot, force->p, f_after);
+        rates_at(force, after.t, after.x, f_after);
         /* The rates at the step's end are J times what Newton's method left: at 1e-6 um/s J is 1e10 / s and they are noise.
            The same slope from the increments carries that remainder over h. */
         for (int r = 0; r < NX; r++) after.f[r] = (D[0] * Z[r] + D[1] * Z[NX + r] + D[2] * Z[2 * NX + r]) / h;
         if (!finite_all(after.x, NX) || !finite_all(f_after, NX)) {
             h *= 0.25;
-            rejected = 1;
+            control.rejected = 1;
             stats[1] += 1;
-            before = 0.0;
+            control.before = 0.0;
             continue;
         }
         memcpy(f0, f_after, sizeof f0);
@@ -405,16 +381,9 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
         if (final) next = write_outputs(q, q->nodes - 2, next, nt, t, X, S);
         if (q->nodes == NODES && !final) drop_oldest(q);
         now = &q->node[q->nodes - 1];
-        if (!first && last_h > 0.0) { /* predictive controller of Gustafsson */
-            double predicted = safety * (h / last_h) * pow(error * error / last_error, -0.25);
-            factor_ = fmin(factor_, fmax(0.2, fmin(8.0, predicted)));
-        }
-        last_error = fmax(error, 1e-2);
-        last_h = h;
-        if (rejected) factor_ = fmin(factor_, 1.0);
-        before = h;
-        h = fmin(h * factor_, longest);
-        rejected = first = 0;
+        memcpy(control.Z, Z, sizeof Z);
+        control.before = h;
+        h = fmin(next_length(&control, h, error, newton), longest);
     }
     return next;
 }

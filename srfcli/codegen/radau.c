@@ -52,6 +52,21 @@ static void imposed(Imposed *f, double t, double *V, double *W, double *W_dot) {
     *V = f->V + f->acceleration * (t - f->since);
 }
 
+/* the rates, and their Jacobian, at a time and a state */
+static void rates_at(Imposed *force, double t, const double *x, double *f) {
+    double V, W, W_dot;
+    imposed(force, t, &V, &W, &W_dot);
+    memset(f, 0, NX * sizeof(double));
+    srf_rates(x, V, W, W_dot, force->p, f);
+}
+
+static void jacobian_at(Imposed *force, double t, const double *x, double *J) {
+    double V, W, W_dot;
+    imposed(force, t, &V, &W, &W_dot);
+    memset(J, 0, NX * NX * sizeof(double));
+    srf_jacobian(x, V, W, W_dot, force->p, J);
+}
+
 #define AT(i, r) (3 * PLACE[r] + (i))       /* place of state r of stage i in the stages' matrix */
 
 /* LU of I - h A (x) J with the Jacobian of each stage; h is 0 where there is none */
@@ -181,7 +196,7 @@ static NOINLINE void filter_estimate(const double *matrix, const int *pivot, dou
 
 /* the embedded estimate of order 3, filtered by the Jacobian at the step's start */
 static double estimate(Imposed *force, const Node *from, const double *f0, double h, const double *Z, const double *J0, double rtol, const double *atol, int cautious) {
-    double matrix[NX * NX], known[NX], e[NX], x[NX], f[NX], V, W, W_dot;
+    double matrix[NX * NX], known[NX], e[NX], x[NX], f[NX];
     int pivot[NX];
     for (int r = 0; r < NX; r++) {
         known[r] = (E[0] * Z[r] + E[1] * Z[NX + r] + E[2] * Z[2 * NX + r]) / h;
@@ -191,10 +206,8 @@ static double estimate(Imposed *force, const Node *from, const double *f0, doubl
     filter_estimate(matrix, pivot, e, 1);
     double size = norm(e, from->x, rtol, atol);
     if (size >= 1.0 && cautious) {
-        imposed(force, from->t, &V, &W, &W_dot);
         for (int r = 0; r < NX; r++) x[r] = from->x[r] + e[r];
-        memset(f, 0, sizeof f);
-        srf_rates(x, V, W, W_dot, force->p, f);
+        rates_at(force, from->t, x, f);
         for (int r = 0; r < NX; r++) e[r] = known[r] + f[r];
         if (finite_all(e, NX)) {
             filter_estimate(matrix, pivot, e, 1);
@@ -219,15 +232,54 @@ static void predict(const double *Z, double before, double h, double *Z0) {
     }
 }
 
+typedef struct {
+    double Z[NZ], before;                   /* increments and length of the last step, from which the next is predicted; 0 for none */
+    double last_h, last_error;              /* of the last step that was taken, 0 for none */
+    int rejected;                           /* whether the step at hand was, before */
+} Control;
+
+/* One attempt at a step as stages() makes it: from the last one's polynomial, then from rest; with its own matrix where that is
+   to be taken `anew` */
+static int attempt(Imposed *force, const Node *from, double h, const Control *control, int anew, double rtol, const double *atol, double *Z, StageMatrix *matrix) {
+    double Z0[NZ];
+    int newton = 0;
+    for (int known = control->before > 0.0; !newton && known >= 0; known--) {
+        if (known) predict(control->Z, control->before, h, Z0);
+        else memset(Z0, 0, sizeof Z0);
+        if (anew) matrix->h = 0.0;
+        newton = stages(force, from, h, Z0, rtol, atol, Z, matrix);
+    }
+    return newton;
+}
+
+/* the length of the next step after one of h with this error, over what is allowed: it is taken below 1 and else tried again;
+   predictive controller of Gustafsson */
+static double next_length(Control *control, double h, double error, int newton) {
+    double safety = 0.9 * (2 * MAX_NEWTON + 1.0) / (2 * MAX_NEWTON + (newton ? newton : MAX_NEWTON));
+    double growth = isfinite(error) ? fmin(8.0, fmax(0.2, safety * pow(error, -0.25))) : 0.25;
+    if (!(error < 1.0)) {
+        growth = fmin(growth, control->rejected || isinf(error) ? 0.5 : 0.9);
+        control->rejected = 1;
+        return h * growth;
+    }
+    if (control->last_h > 0.0) {
+        double predicted = safety * (h / control->last_h) * pow(error * error / control->last_error, -0.25);
+        growth = fmin(growth, fmax(0.2, fmin(8.0, predicted)));
+    }
+    if (control->rejected) growth = fmin(growth, 1.0);
+    control->last_h = h;
+    control->last_error = fmax(error, 1e-2);
+    control->rejected = 0;
+    return h * growth;
+}
+
 static double first_step(Imposed *force, const Node *n, double span, double rtol, const double *atol) {
-    double x[NX], f[NX], d[NX], V, W, W_dot;
+    double x[NX], f[NX], d[NX];
     double d0 = norm(n->x, n->x, rtol, atol), d1 = norm(n->f, n->x, rtol, atol);
     double h = d0 < 1e-5 || d1 < 1e-5 ? 1e-6 : 0.01 * d0 / d1;
     h = fmin(h, span);
     for (int r = 0; r < NX; r++) x[r] = n->x[r] + h * n->f[r];
-    memset(f, 0, sizeof f);
-    imposed(force, n->t + h, &V, &W, &W_dot);
-    srf_rates(x, V, W, W_dot, force->p, f);
+    rates_at(force, n->t + h, x, f);
     for (int r = 0; r < NX; r++) d[r] = (f[r] - n->f[r]) / h;
     double d2 = norm(d, n->x, rtol, atol), steepest = fmax(d1, d2);
     if (!isfinite(steepest)) return fmin(1e-9, span);
