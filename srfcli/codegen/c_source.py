@@ -477,10 +477,10 @@ def library_of(write: Callable[[], CText], parts: Sequence[str]) -> ctypes.CDLL:
     if folder is not None:
         path = folder / f"{key}.so"
         with contextlib.suppress(OSError):  # a cache that cannot be written, or a disk from which nothing may be run
-            return _load(path if _kept(path) else _build(write(), path, sealed=True))
+            return ctypes.CDLL(str(path if _kept(path) else _build(write(), path, sealed=True)))
     try:
         with tempfile.TemporaryDirectory(prefix="srf-", ignore_cleanup_errors=True) as scratch:
-            return _load(_build(write(), Path(scratch) / f"{key}.so"))  # it stays in memory when its file is gone
+            return ctypes.CDLL(str(_build(write(), Path(scratch) / f"{key}.so")))  # it stays in memory when its file is gone
     except OSError as error:
         raise SrfError(
             f"no model can be compiled in {error.filename or 'the folder of temporary files'}: {error.strerror or error}",
@@ -557,7 +557,3 @@ def _kept(path: Path) -> bytes | None:
         return found if is_sealed(path.name, found, mark) else None
     except (OSError, SrfError):
         return None
-
-
-def _load(path: Path) -> ctypes.CDLL:
-    return ctypes.CDLL(str(path))

@@ -198,7 +198,6 @@ static int explicit_steps(Imposed *force, History *q, double b, double rtol, con
         steep = steep_after;
         stiff = stiffness > STIFF ? stiff + 1 : 0;
         stats[0] += 1;
-        stats[2] += 1;
         double after = time_after(now->t, h, b, final, &carry);
         if (next < nt && t[next] <= after) {
             for (int i = 13; i < 16; i++) {

@@ -347,7 +347,6 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
                 error = fmax(error, other);
             }
         }
-        stats[2] += newton ? newton : MAX_NEWTON;
         if (!(error < 1.0)) {
             stats[1] += 1;
             h = next_length(&control, h, error, newton);
@@ -388,7 +387,7 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
     return next;
 }
 
-/* Returns how many output times were filled; stats: steps, rejected, Newton iterations, time reached.
+/* Returns how many output times were filled; stats: steps, rejected, time reached.
    X (nt, NX), S (nt, NX, ns); column k < own of S belongs to parameter which[k], or to an initial condition where which[k] < 0;
    the numbers of table i, all of them, own the columns from column[i] on, if that is not negative.
    The output at t[0], the start, is the caller's. Another thread may set *stop: the motion then ends with the step in hand. */
@@ -422,8 +421,8 @@ int srf_integrate(int n_segments, const double *edges, const double *drive, cons
         if (ns) memcpy(S + (size_t)next * size, S0, size * sizeof(double));
         next++;
     }
-    stats[0] = stats[1] = stats[2] = 0.0;
-    stats[3] = edges[0];
+    stats[0] = stats[1] = 0.0;
+    stats[2] = edges[0];
     for (int k = 0; k < n_segments; k++) {
         force.low = force.at = range[2 * k];
         force.high = range[2 * k + 1] - 1;
@@ -432,12 +431,12 @@ int srf_integrate(int n_segments, const double *edges, const double *drive, cons
         force.since = drive[3 * k + 2];
         int done = segment(&force, &q, edges[k], edges[k + 1], rtol, atol, longest[k], max_steps, next, nt, t, X, S, stats, stop);
         if (done < 0) {
-            stats[3] = q.node[q.nodes - 1].t;
+            stats[2] = q.node[q.nodes - 1].t;
             free(block);
             return -1 - done;
         }
         next = done;
-        stats[3] = edges[k + 1];
+        stats[2] = edges[k + 1];
         q.node[0] = q.node[q.nodes - 1];
         if (ns) memmove(q.S, q.S + (size_t)(q.nodes - 1) * size, size * sizeof(double));
     }

@@ -156,14 +156,14 @@ static void chained(int w, const double *map, const double *before, double *out)
 }
 
 /* Newton's method for the periodic orbits of B points, each until its step is below tol; x (B, N, NX) and X (B, N, MS, NX) are the
-   guesses, then the last iterates. `size` (B, NX) measures x. Returns the most iterations that any took, -1 without memory. */
+   guesses, then the last iterates. `size` (B, NX) measures x. Returns 0 without memory. */
 EXPORT int srf_orbits(int B, int N, const double *tau, const double *h, const double *p, double *x, double *X, const double *size,
                       double tol, int max_iterations, double *monodromy, unsigned char *converged) {
     enum { w = NX + 1 };
     double *local = malloc(sizeof(double) * N * (S * w + NX * w + NX + S)), map[NX * w];
-    if (!local) return -1;
+    if (!local) return 0;
     double *prefix = local + (size_t)N * S * w, *dx = prefix + (size_t)N * NX * w, *dX = dx + (size_t)N * NX;
-    int pivot[S], most = 0;
+    int pivot[S];
     for (int b = 0; b < B; b++) {
         const double *own = p + (size_t)b * NP, *scale = size + (size_t)b * NX;
         double *y = x + (size_t)b * N * NX, *Y = X + (size_t)b * N * S, *M = monodromy + (size_t)b * NX * NX;
@@ -173,7 +173,6 @@ EXPORT int srf_orbits(int B, int N, const double *tau, const double *h, const do
             memset(now, 0, sizeof now);
             for (int a = 0; a < NX; a++) now[a * w + a] = 1.0;
             int good = 1;
-            most = iteration > most ? iteration : most;
             for (int i = 0; i < N && good; i++) {
                 memcpy(prefix + (size_t)i * NX * w, now, sizeof now);
                 good = interval(h[i], tau + i * MS, own, y + i * NX, Y + i * S, y + (i + 1 < N ? i + 1 : 0) * NX, 0, 0, 0, pivot,
@@ -223,7 +222,7 @@ EXPORT int srf_orbits(int B, int N, const double *tau, const double *h, const do
         }
     }
     free(local);
-    return most;
+    return 1;
 }
 
 /* (M - sigma)^-1 in real form, [M - re, im; -im, M - re], factored; M transposed where asked for */

@@ -67,7 +67,9 @@ def _evaluated(n: int, order: int, p: Any, i: int, x: Any) -> Any:
         return 0.0 * x
     place, first, spacing, count = (float(np.real(value)) for value in p[n + 4 * i : n + 4 * i + 4])
     real = np.real(x)
-    cell, _ = _cells(first, spacing, int(count), real)
+    r = np.clip((real - first) / spacing, 0.0, count - 3.0)
+    known = np.where(np.isnan(r), 0.0, r)  # a motion that was lost: its value is NaN, its cell is any
+    cell = np.minimum(known.astype(int) if np.ndim(r) else int(known), int(count) - 4)
     share = (x - first) / spacing - cell
     low, high = (real <= first), (real >= first + spacing * (count - 3))
     share = np.where(low, 0.0, np.where(high, 1.0, share))
@@ -79,13 +81,6 @@ def _evaluated(n: int, order: int, p: Any, i: int, x: Any) -> Any:
     if order:
         total = np.where(low | high, 0.0, total)
     return total if np.ndim(x) else total[()]
-
-
-def _cells(first: float, spacing: float, count: int, x: Any) -> tuple[Any, Any]:
-    r = np.clip((x - first) / spacing, 0.0, count - 3.0)
-    known = np.where(np.isnan(r), 0.0, r)  # a motion that was lost: its value is NaN, its cell is any
-    cell = np.minimum(known.astype(int) if np.ndim(r) else int(known), count - 4)
-    return cell, r - cell
 
 
 def _value(f: Any) -> tuple[Any, ...]:

@@ -49,9 +49,9 @@ class Load(abc.ABC):
     def piece(self, t: float) -> LoadPiece:
         """Return W and dW/dt as a function of one time, valid on the smooth piece that holds at `t`."""
 
-    @abc.abstractmethod
     def rest(self, t: float) -> float:
-        """Return the load under which sliding at time `t` is steady when nothing is modulated."""
+        """Return the load under which sliding at time `t` is steady when nothing is modulated: W itself where nothing is."""
+        return self.piece(t)(t)[0]
 
     def check(self, start: float, end: float) -> None:  # noqa: B027
         """Raise SrfError where the load is not known on all of [start, end]."""
@@ -88,9 +88,6 @@ class ConstantLoad(Load):
     def piece(self, t: float) -> LoadPiece:
         W0 = self.W0
         return lambda s: (W0, 0.0)
-
-    def rest(self, t: float) -> float:
-        return self.W0
 
     def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
         _check_interval(start, end)
@@ -299,9 +296,6 @@ class SampledLoad(Load):
             return _horner(rows[i], s - knots[i])
 
         return spline
-
-    def rest(self, t: float) -> float:
-        return self.piece(t)(t)[0]
 
     def __call__(self, t: Array) -> tuple[Array, Array]:
         t = np.asarray(t, dtype=float)
@@ -575,9 +569,6 @@ class LoadSteps(Load):
             return W, b + h * (2 * c + h * (3 * d + h * (4 * e + h * (5 * f + h * 6 * g))))
 
         return polynomial
-
-    def rest(self, t: float) -> float:
-        return self.piece(t)(t)[0]
 
     def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
         """Return knots (k + 1,) and coefficients (k, 7), lowest power first in t - knots[i]: W on [start, end], exactly."""

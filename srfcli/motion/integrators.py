@@ -92,7 +92,7 @@ def integrate(
     for i in by_tables:
         columns[i], own = own, own + tables[i].coefficients.size
     x, S = np.full((t.size, start.size), np.nan), np.full((t.size, *S0.shape), np.nan)
-    stats, stop = np.zeros(4), ctypes.c_int(0)
+    stats, stop = np.zeros(3), ctypes.c_int(0)
     arguments = (
         *imposed_arguments(t, drive, load), doubles(p), doubles(start), count,
         len(by), integers(columns), integers(np.array(by or [-1], dtype=np.intc)), doubles(sensitivity_scale(p, by)), doubles(S0),
@@ -107,7 +107,7 @@ def integrate(
         filled = int(np.isfinite(x).all(axis=1).sum())
         raise Stopped(Motion(x, S, Status.INTERRUPTED, float(t[max(filled - 1, 0)]), int(stats[0]))) from None
     status = Status.OK if filled == t.size else Status.INTEGRATION
-    return Motion(x, S, status, float(stats[3]), int(stats[0]))
+    return Motion(x, S, status, float(stats[2]), int(stats[0]))
 
 
 def pieces(t: Array, drive: Drive, load: Load) -> Iterator[tuple[float, float]]:
@@ -192,10 +192,11 @@ def integrate_lsoda(
     loose = S_SHARE * rtol
     tolerance = np.concatenate([atol, (S_SHARE * np.outer(atol, sensitivity_scale(p, by)[:k])).ravel()])
     relative = np.concatenate([np.full(n, rtol), np.full(n * k, loose)])
-    system = _Rates(model, p, by)
+    names = ("rates", "rates_jacobian", *(["rates_parameters"] if k else []))
+    functions = [scalar_function(model, name, p) for name in names]
     status, reached, steps = Status.OK, float(t[0]), 0
     for a, b in pieces(t, drive, load):
-        f, df = system.on_piece(drive, load, 0.5 * (a + b))
+        f, df = _on_piece(functions, np.array(by, dtype=int), drive, load, 0.5 * (a + b))
         wanted = np.nonzero((t > a) & (t <= b))[0]
         times = np.unique([a, *t[wanted], b])
         found, good, count = _march(f, df if not k else None, state, times, relative, tolerance, load.longest_step(a, b))
@@ -209,46 +210,41 @@ def integrate_lsoda(
     return Motion(y[:, :n], y[:, n:].reshape(t.size, n, k), status, reached, steps)
 
 
-class _Rates:
-    """Rates of the state and of its sensitivities as functions of (t, y) on one smooth piece."""
+def _on_piece(functions: Sequence[ScalarFunction], by: Array, drive: Drive, load: Load, within: float) -> tuple[Rates, Rates]:
+    """Return the rates of state and sensitivities, and the Jacobian, as functions of (t, y) where the piece at `within` holds.
 
-    def __init__(self, model: GeneratedModel, p: Array, by: Sequence[int]) -> None:
-        self.n, self.k = len(model.states), len(by)
-        self.rates, self.jacobian = (scalar_function(model, name, p) for name in ("rates", "rates_jacobian"))
-        self.by = np.array(by, dtype=int)
-        self.parameters = scalar_function(model, "rates_parameters", p) if self.k else None
+    `functions` of one state are the rates, their Jacobian and, where there are derivatives `by` parameters, these.
+    """
+    rates_of, jacobian_of, *by_parameters = functions
+    W_at = load.piece(within)
+    V0, acceleration, since = drive.piece(within)
 
-    def on_piece(self, drive: Drive, load: Load, within: float) -> tuple[Rates, Rates]:
-        """Return the rates and the Jacobian of the state, as functions of (t, y), where the piece at `within` holds."""
-        W_at = load.piece(within)
-        V0, acceleration, since = drive.piece(within)
-        n, k = self.n, self.k
+    def inputs(t: float) -> tuple[float, float, float]:
+        return (V0 + acceleration * (t - since) if acceleration else V0, *W_at(t))
 
-        def inputs(t: float) -> tuple[float, float, float]:
-            return (V0 + acceleration * (t - since) if acceleration else V0, *W_at(t))
+    def rates(t: float, y: Array) -> object:
+        try:
+            return rates_of(y.tolist(), *inputs(t))
+        except (ArithmeticError, ValueError):
+            return np.full(y.size, OVERFLOWN_RATE)
 
-        def rates(t: float, y: Array) -> object:
-            try:
-                return self.rates(y.tolist(), *inputs(t))
-            except (ArithmeticError, ValueError):
-                return np.full(n, OVERFLOWN_RATE)
+    def jacobian(t: float, y: Array) -> object:
+        try:
+            return jacobian_of(y.tolist(), *inputs(t))
+        except (ArithmeticError, ValueError):
+            return np.full((y.size, y.size), OVERFLOWN_RATE)
 
-        def jacobian(t: float, y: Array) -> object:
-            try:
-                return self.jacobian(y.tolist(), *inputs(t))
-            except (ArithmeticError, ValueError):
-                return np.full((n, n), OVERFLOWN_RATE)
+    def augmented(t: float, y: Array) -> object:
+        n = y.size // (1 + by.size)
+        x, given = y[:n].tolist(), inputs(t)
+        try:
+            direct = np.array(by_parameters[0](x, *given))[:, by] * (by >= 0)
+            S_rate = np.array(jacobian_of(x, *given)) @ y[n:].reshape(n, by.size) + direct
+            return np.concatenate([rates_of(x, *given), S_rate.ravel()])
+        except (ArithmeticError, ValueError):
+            return np.full(y.size, OVERFLOWN_RATE)
 
-        def augmented(t: float, y: Array) -> object:
-            x, given = y[:n].tolist(), inputs(t)
-            try:
-                direct = np.array(self.parameters(x, *given))[:, self.by] * (self.by >= 0)  # type: ignore[misc]
-                S_rate = np.array(self.jacobian(x, *given)) @ y[n:].reshape(n, k) + direct
-                return np.concatenate([self.rates(x, *given), S_rate.ravel()])
-            except (ArithmeticError, ValueError):
-                return np.full(n * (1 + k), OVERFLOWN_RATE)
-
-        return (augmented if k else rates), jacobian
+    return (augmented if by.size else rates), jacobian
 
 
 def _march(

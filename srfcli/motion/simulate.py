@@ -74,7 +74,12 @@ def simulate(
         motion = integrate(model, q, drive=drive, load=load, t=t, start=begun, tables=tables, rtol=rtol, atol=tolerances)
     except Stopped as stop:
         motion = stop.motion
-    return _trace(model, full, drive, load, t, motion.x, motion.status, motion.reached)
+    x, V, (W, W_dot) = motion.x, drive(t), load(t)
+    age = next(i for i, name in enumerate(model.states) if name.startswith("ln_") and name != "ln_v")
+    with np.errstate(all="ignore"):
+        mu, u = model.friction(x, V, W, W_dot, full), model.elongation(x, V, W, W_dot, full)
+        v, phi = np.exp(x[:, model.states.index("ln_v")]), np.exp(x[:, age])
+    return Trace(tuple(model.states), t, x, u, v, phi, mu, W, V, motion.status, motion.reached)
 
 
 def _parameters(model: GeneratedModel, p: Array, drive: Drive, load: Load, t: Array) -> Array:
@@ -104,17 +109,6 @@ def _absolute(model: GeneratedModel, drive: Drive, t: Array, rtol: float) -> Arr
     ends = drive(np.unique([*t[[0, -1]], *(b for b in drive.breaks if t[0] < b < t[-1])]))
     fastest = max(float(np.abs(ends).max()), 1e-3)
     return rtol * np.array([fastest if name == "z" else 1.0 for name in model.states])
-
-
-def _trace(
-    model: GeneratedModel, q: Array, drive: Drive, load: Load, t: Array, x: Array, status: Status, reached: float
-) -> Trace:
-    V, (W, W_dot) = drive(t), load(t)
-    with np.errstate(all="ignore"):
-        mu, u = model.friction(x, V, W, W_dot, q), model.elongation(x, V, W, W_dot, q)
-        ages = [i for i, name in enumerate(model.states) if name.startswith("ln_") and name != "ln_v"]
-        v, phi = np.exp(x[:, model.states.index("ln_v")]), np.exp(x[:, ages[0]])
-    return Trace(tuple(model.states), t, x, u, v, phi, mu, W, V, status, reached)
 
 
 # Stick-slip in a record: where the spring lets go, by how much and how often.

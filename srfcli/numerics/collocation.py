@@ -79,11 +79,11 @@ def newton_orbits(
     B, N, n = orbit.x.shape
     monodromy, converged = np.full((B, n, n), np.nan), np.zeros(B, dtype=np.uint8)
     parameters = np.ascontiguousarray(p.T)
-    used = library.srf_orbits(
+    done = library.srf_orbits(
         B, N, _at(orbit.phases), _at(orbit.steps), _at(parameters), _at(orbit.x), _at(orbit.stages), _at(size),
         ctypes.c_double(tol), max_iterations, _at(monodromy), _at(converged),
     )  # fmt: skip
-    if used < 0:
+    if not done:
         raise MemoryError
     return monodromy, converged.astype(bool)
 

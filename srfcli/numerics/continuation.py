@@ -311,21 +311,18 @@ def trace(
     """
     curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
     try:
-        for item in follow(model, plane, start, settings):
-            if isinstance(item, Status):
-                curve.end = item
-            else:
-                curve.points.append(item)
-            progress(f"{name}{len(curve.points)} points")
-        if curve.end is Status.CLOSED:
-            curve.start = Status.CLOSED
-            return curve
-        for item in follow(model, plane, start, settings, forward=False):
-            if isinstance(item, Status):
-                curve.start = item
-            else:
-                curve.points.insert(0, reversed_tangent(item))
-            progress(f"{name}{len(curve.points)} points")
+        for forward in (True, False):
+            for item in follow(model, plane, start, settings, forward=forward):
+                if isinstance(item, CurvePoint):
+                    curve.points.insert(len(curve.points) if forward else 0, item if forward else reversed_tangent(item))
+                elif forward:
+                    curve.end = item
+                else:
+                    curve.start = item
+                progress(f"{name}{len(curve.points)} points")
+            if curve.end is Status.CLOSED:
+                curve.start = Status.CLOSED
+                break
     except KeyboardInterrupt:
         curve.end = Status.INTERRUPTED
     return curve

@@ -11,7 +11,6 @@ from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.numerics.collocation import (
     LOG_STEP,
     STAGES,
-    Condensed,
     Discretisation,
     condense,
     gauss,
@@ -198,30 +197,24 @@ def _newton(model: GeneratedModel, batch: OrbitBatch, active: Array, size: Array
     """Bring the orbits `active` of a batch to convergence in place, as the compiled equations do."""
     for _ in range(max_iterations):
         with np.errstate(all="ignore"):  # a diverging point overflows; it is dropped below
-            linear, dx, dstages, finite = newton_step(model, batch.p[:, active], batch.orbit.part(active))
+            linear = condense(model, batch.p[:, active], batch.orbit.part(active))
+            M, n = linear.monodromy, size.shape[-1]
+            start = solved(np.eye(n) - M, linear.prefix[..., -1, :n, n:])
+            head = np.concatenate([start, np.ones_like(start[..., :1, :])], axis=-2)
+            dx, dstages = (change[..., 0] for change in respond(linear, head))
+            finite: Any = np.isfinite(M).all(axis=(-1, -2)) & np.isfinite(dx).all(axis=(-1, -2))
+            finite &= np.isfinite(dstages).all(axis=(-1, -2, -3))
             limit = step_limit(model, dx, dstages)
             change = (np.abs(dx) / size[active][:, None, :]).max(axis=(-1, -2))
         limit = np.where(finite, limit, 0.0)
         batch.orbit.x[active] += limit[:, None, None] * np.where(finite[:, None, None], dx, 0.0)
         batch.orbit.stages[active] += limit[:, None, None, None] * np.where(finite[:, None, None, None], dstages, 0.0)
-        batch.monodromy[active] = linear.monodromy
+        batch.monodromy[active] = M
         done = finite & (change < tol)
         batch.converged[active[done]] = True
         active = active[finite & ~done]
         if not active.size:
             break
-
-
-def newton_step(model: GeneratedModel, p: Array, orbit: Discretisation) -> tuple[Condensed, Array, Array, Array]:
-    """Return the linearisation and the Newton corrections; the last array says which points are finite."""
-    n = orbit.x.shape[-1]
-    linear = condense(model, p, orbit)
-    matrix = np.eye(n) - linear.monodromy
-    start = solved(matrix, linear.prefix[..., -1, :n, n:])
-    head = np.concatenate([start, np.ones_like(start[..., :1, :])], axis=-2)
-    dx, dstages = (change[..., 0] for change in respond(linear, head))
-    finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(dx).all(axis=(-1, -2))
-    return linear, dx, dstages, finite & np.isfinite(dstages).all(axis=(-1, -2, -3))
 
 
 # Orbits wherever they can be found: from guesses, from each other, or by raising eps from 0.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import sympy as sp
@@ -318,7 +318,7 @@ def to_python(system: System) -> str:
     """Return a NumPy function of the dispersion coefficients C0..Cn that stands by itself; units um, s, N, rad."""
     coefficients = dispersion_coefficients(system)
     meaning = _meaning(system)
-    used = _symbols_in([*coefficients, *(e for _, e in meaning)])
+    used = {s.name for e in (*coefficients, *(e for _, e in meaning)) for s in e.free_symbols}
     arguments = [p.name for p in system.parameters if p.name in used]
     body = [f"    {python_name(s)} = {numpy_text(e)}" for s, e in meaning if s in used]
     rows = [numpy_text(c) for c in coefficients]
@@ -339,10 +339,6 @@ def _meaning(system: System) -> list[tuple[str, sp.Expr]]:
     if system.elastic:
         pairs.append(("eta", 1 + symbol("K") / symbol("kappa")))
     return pairs
-
-
-def _symbols_in(expressions: Sequence[sp.Expr]) -> set[str]:
-    return {s.name for e in expressions for s in e.free_symbols}
 
 
 def paper_text(findings: Sequence[Finding]) -> str:
@@ -371,5 +367,4 @@ def _paper_line(f: Finding) -> str:
 
 def paper_document(findings: Sequence[Finding]) -> dict[str, Any]:
     """Return the comparison with the paper as plain data."""
-    keys = ("kind", "label", "line", "verdict", "printed", "right", "note")
-    return {"schema": PAPER_SCHEMA, "findings": [{k: getattr(f, k) for k in keys} for f in findings]}
+    return {"schema": PAPER_SCHEMA, "findings": [asdict(f) for f in findings]}

@@ -78,8 +78,8 @@ def check_equation(system: System, equation: Equation) -> Finding:
     factor = sp.I if equation.times_i else sp.S.One
     verdict = "agrees" if _equal(factor * printed, right) else "misprint"
     shown = equation.printed if verdict == "agrees" else str(_like(right / factor, printed))
-    texts = [f"{equation.left} = {f'i*({body})' if equation.times_i else body}" for body in (equation.printed, shown)]
-    return Finding("equation", equation.label, equation.line, verdict, *texts, equation.note)
+    before, after = (f"{equation.left} = {f'i*({text})' if equation.times_i else text}" for text in (equation.printed, shown))
+    return Finding("equation", equation.label, equation.line, verdict, before, after, equation.note)
 
 
 def _equal(first: sp.Expr, second: sp.Expr) -> bool:
