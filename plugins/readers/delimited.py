@@ -346,35 +346,29 @@ class _Table:
 
     def _fast(self, block: bytes, columns: tuple[int, ...]) -> Sequence[np.ndarray] | None:
         """Return the columns of a block in which each line has a number in each cell, else None."""
-        if b'"' in block or b"#" in block or b"%" in block or b"_" in block:
+        if any(sign in block for sign in b'"#%_'):
             return None
         if self.decimal == ",":
             block = block.replace(b",", b".")
-        if self.delimiter == " ":
-            return self._blanks(block, columns)
-        codes = np.frombuffer(block if block.endswith(b"\n") else block + b"\n", dtype=np.uint8)
-        ends = np.flatnonzero(codes == 10)
-        counts = np.diff(np.searchsorted(np.flatnonzero(codes == ord(self.delimiter)), ends), prepend=0)
-        if (counts != len(self.headings) - 1).any():
-            return None
+        blanks = self.delimiter == " "
+        if blanks:
+            lines = sum(bool(line.strip()) for line in block.split(b"\n"))
+        else:
+            codes = np.frombuffer(block if block.endswith(b"\n") else block + b"\n", dtype=np.uint8)
+            ends = np.flatnonzero(codes == 10)
+            counts = np.diff(np.searchsorted(np.flatnonzero(codes == ord(self.delimiter)), ends), prepend=0)
+            if (counts != len(self.headings) - 1).any():
+                return None
+            lines = ends.size
+        # between blanks all columns are read: a line may have too many
+        separator, read, width = (None, None, len(self.headings)) if blanks else (self.delimiter, columns, len(columns))
         try:
-            table = np.loadtxt(
-                io.StringIO(block.decode("ascii")), delimiter=self.delimiter, comments=None, usecols=columns, ndmin=2
-            )
+            table = np.loadtxt(io.StringIO(block.decode("ascii")), delimiter=separator, comments=None, usecols=read, ndmin=2)
         except (ValueError, UnicodeDecodeError):
             return None
-        return None if table.shape[0] != ends.size else [np.ascontiguousarray(table[:, k]) for k in range(len(columns))]
-
-    def _blanks(self, block: bytes, columns: tuple[int, ...]) -> Sequence[np.ndarray] | None:
-        """Return the columns of a block of numbers between blanks, None where a line has more or fewer or none."""
-        lines = [line for line in block.split(b"\n") if line.strip()]
-        try:
-            table = np.loadtxt(io.StringIO(block.decode("ascii")), comments=None, ndmin=2)
-        except (ValueError, UnicodeDecodeError):
+        if table.shape != (lines, width):
             return None
-        if table.shape != (len(lines), len(self.headings)):
-            return None
-        return [np.ascontiguousarray(table[:, k]) for k in columns]
+        return [np.ascontiguousarray(table[:, k]) for k in (columns if blanks else range(width))]
 
     def _slow(self, block: bytes, columns: tuple[int, ...], first: int, clocks: Sequence[_Clock]) -> Sequence[np.ndarray]:
         """Return the columns of a block cell by cell: empty ones are NaN, bad ones raise SrfError with line and column."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from srfcli.core.errors import damaged
 from srfcli.laws.api import Source, SrfError, reader
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -15,7 +16,6 @@ MOST = 10_000  # datasets of a file, and columns of one
 UNITS = ("units", "unit", "Units", "Unit")  # attributes that state them
 HEADINGS = ("columns", "column_names", "Columns", "names")  # attributes that head a matrix's columns
 TEXT = ("char", "string", "cell", "function_handle", "logical")  # MATLAB classes that are no numbers
-WHOLE = "Was the file copied to its end?"
 
 
 def _is_hdf5(head: bytes) -> bool:
@@ -56,14 +56,8 @@ def _library(path: Path) -> Any:
 
 
 def _opened(h5py: Any, path: Path) -> Any:
-    try:
+    with damaged(f"{path}: not a whole HDF5 file"):
         return h5py.File(path, "r")
-    except Exception as error:  # a damaged file fails in many ways
-        raise SrfError(f"{path}: not a whole HDF5 file: {_told(error)}", WHOLE) from None
-
-
-def _told(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _columns(h5py: Any, file: Any, path: Path, matlab: bool) -> dict[str, tuple[str, Any, int]]:
@@ -93,10 +87,8 @@ def _columns(h5py: Any, file: Any, path: Path, matlab: bool) -> dict[str, tuple[
                 places.extend((heads[k], name, (axis, k), item.shape[axis], own[k]) for k in range(count))
         return True if len(places) > MOST else None
 
-    try:
+    with damaged(f"{path}: not a whole HDF5 file"):
         file.visititems(visit)
-    except Exception as error:
-        raise SrfError(f"{path}: not a whole HDF5 file: {_told(error)}", WHOLE) from None
     names = [place[0] for place in places]
     found = {}
     for short, name, part, length, unit in places[:MOST]:
@@ -121,12 +113,10 @@ def _text(value: Any) -> str:
 
 
 def _part(file: Any, path: Path, name: str, part: Any, rows: slice) -> np.ndarray:
-    try:
+    with damaged(f"{path}: dataset '{name}' cannot be read"):
         data = file[name]
         if isinstance(part, str):
             return np.asarray(data[rows][part], dtype=float)
         axis, index = part
         place = [index if index is not None else 0] * data.ndim
         return np.asarray(data[tuple(rows if k == axis else place[k] for k in range(data.ndim))], dtype=float)
-    except Exception as error:
-        raise SrfError(f"{path}: dataset '{name}' cannot be read: {_told(error)}", WHOLE) from None

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from srfcli.core.errors import WHOLE
 from srfcli.laws.api import Source, SrfError, reader
 
 FILE_HEADER, CHANNEL_HEADER = 36, 84  # bytes
@@ -61,8 +62,7 @@ def look(path: Path) -> Source:
     width = size // (rows * len(headings)) if rows else 0
     if width not in (4, 8) or size != width * rows * len(headings):
         raise SrfError(
-            f"{path}: {size} bytes of numbers for {len(headings)} channels of {rows} records, expected 4 or 8 bytes each",
-            "Was the file copied to its end?",
+            f"{path}: {size} bytes of numbers for {len(headings)} channels of {rows} records, expected 4 or 8 bytes each", WHOLE
         )
     data = np.memmap(path, dtype=f">f{width}", mode="r", offset=begin, shape=(len(headings), rows))
 

@@ -11,6 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from srfcli.core.errors import WHOLE
 from srfcli.laws.api import Source, SrfError, reader
 
 # Read here and not by scipy.io.loadmat, whose compiled code ends the process on some damaged files.
@@ -23,7 +24,6 @@ STRUCT, DEEPEST = 2, 4  # the class of a struct, and how many may stand in each 
 COMPLEX = 0x0800
 LARGEST_STRUCT = 2**27  # bytes of a struct, which is unpacked as a whole; a larger one is passed over
 Buffer = bytes | memoryview
-WHOLE = "Was the file copied to its end?"
 
 
 @dataclass(frozen=True)

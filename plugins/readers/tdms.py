@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from srfcli.core.errors import WHOLE, damaged
 from srfcli.laws.api import Source, SrfError, reader
 
 ROWS = 2**18  # read at a time
 UNITS = ("unit_string", "NI_UnitDescription", "units", "unit")  # properties of a channel that state one
-WHOLE = "Was the file copied to its end?"
 
 
 @reader(name="tdms", suffixes=(".tdms",), sniff=lambda head: head.startswith(b"TDSm"))
@@ -18,11 +18,9 @@ def tdms(path: Path) -> Source:
     """LabVIEW TDMS, a channel for each column; units in its properties or [columns], the time from wf_increment"""
     library = _library(path)
     with _opened(library, path) as file:
-        try:
+        with damaged(f"{path}: not a whole TDMS file"):
             channels = [c for group in file.groups() for c in group.channels() if _numeric(c)]
             cut = file.file_status.incomplete_final_segment
-        except Exception as error:
-            raise SrfError(f"{path}: not a whole TDMS file: {_told(error)}", WHOLE) from None
         if cut:
             raise SrfError(f"{path}: not a whole TDMS file: its last segment breaks off", WHOLE)
         rows = max((len(c) for c in channels), default=0)
@@ -61,14 +59,8 @@ def _library(path: Path) -> Any:
 
 
 def _opened(library: Any, path: Path) -> Any:
-    try:
+    with damaged(f"{path}: not a whole TDMS file"):
         return library.TdmsFile.open(path)
-    except Exception as error:  # a damaged file fails in many ways
-        raise SrfError(f"{path}: not a whole TDMS file: {_told(error)}", WHOLE) from None
-
-
-def _told(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _numeric(channel: Any) -> bool:
@@ -78,10 +70,8 @@ def _numeric(channel: Any) -> bool:
 def _part(file: Any, path: Path, place: Any, at: int, count: int) -> np.ndarray:
     if isinstance(place[0], float):
         return np.asarray(place[0] + place[1] * np.arange(at, at + count))
-    try:
+    with damaged(f"{path}: channel '{place[1]}' cannot be read"):
         found = np.asarray(file[place[0]][place[1]].read_data(offset=at, length=count), dtype=float)
-    except Exception as error:
-        raise SrfError(f"{path}: channel '{place[1]}' cannot be read: {_told(error)}", WHOLE) from None
     if found.size != count:
         raise SrfError(f"{path}: channel '{place[1]}' ends early", WHOLE)
     return found

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
 LONGEST_MESSAGE = 2000  # characters of a message
 CHECK_PATH = "Check path and permissions."
+WHOLE = "Was the file copied to its end?"
 # control characters but tab and newline, DEL and the second set, marks that are not seen or turn the line round, lone
 # surrogates (bytes of file names that are no text): what a terminal acts on, or shows as something else than it is
 _UNSEEN = re.compile(
@@ -77,6 +79,16 @@ class ExpressionError(SrfError):
         text = self.text.replace("\n", " ").replace("\t", " ")
         text = _UNSEEN.sub("?", text)  # one sign for one, as the caret counts
         return f"  {text}\n  {' ' * self.column}^"
+
+
+@contextmanager
+def damaged(what: str) -> Iterator[None]:
+    """Raise SrfError, `what` and what it says, for whatever a library raises inside over a damaged file: that may be anything."""
+    try:
+        yield
+    except Exception as error:
+        told = " ".join(str(error).split())[:200]
+        raise SrfError(f"{what}: {told or type(error).__name__}", WHOLE) from None
 
 
 def check_choice(name: str, value: str | None, choices: Sequence[str]) -> None:
