@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -184,10 +184,9 @@ def resolve(
     toml = toml or TomlSettings()
     known = {p.name: p for p in parameters}
     layers: dict[str, list[Setting]] = {name: [] for name in known}
-    listed: list[tuple[str, dict[str, Any]]] = [
-        ("flag", dict(flags)),
-        ("environment SRF_SET", dict(_assignments(env.get("SRF_SET", ""), "SRF_SET"))),
-    ]
+    stated = filter(str.strip, env.get("SRF_SET", "").replace(";", ",").split(","))
+    assigned = dict(parse_assignment(part, where="SRF_SET") for part in stated)
+    listed: list[tuple[str, Mapping[str, Any]]] = [("flag", flags), ("environment SRF_SET", assigned)]
     for origin, given in listed:
         for name, value in given.items():
             require_parameter(name, parameters, where=where)
@@ -253,12 +252,6 @@ def _owner(variable: str, known: Mapping[str, Parameter]) -> str | None:
     wanted = variable[4:]
     fitting = [wanted] if wanted in known else [n for n in known if n.upper() == wanted]
     return fitting[0] if len(fitting) == 1 else None
-
-
-def _assignments(text: str, where: str) -> Iterator[tuple[str, str]]:
-    for part in text.replace(";", ",").split(","):
-        if part.strip():
-            yield parse_assignment(part, where=where)
 
 
 def parse_assignment(text: str, *, where: str = "--set") -> tuple[str, str]:

@@ -67,10 +67,14 @@ class Node:
         node = self.get(key)
         return default if node is None else how(node)
 
-    def require(self, key: str, hint: str) -> Node:
+    def at(self, key: str) -> Node:
+        """Return the value under a key; where there is none, None at its place."""
+        return Node(self.file, self.value.get(key), (*self.place, key), self.source)
+
+    def require(self, key: str, hint: str | None = None) -> Node:
         """Return the value under a key; raises SrfError where there is none."""
         if key not in self.value:
-            Node(self.file, None, (*self.place, key), self.source).fail("missing", hint)
+            self.at(key).fail("missing", hint)
         return self.child(key)
 
     def keys(self, known: Iterable[str]) -> None:

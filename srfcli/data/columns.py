@@ -46,7 +46,7 @@ def open_source(path: Path, *, registry: Registry, format: str | None = None) ->
         raise _unreadable(path, error) from None
     if not head:
         raise SrfError(f"{path}: the file is empty", "A recording has a line of headings and a line for each sample.")
-    reader = registry.reader(registry.find("reader", format)) if format else _sniffed(path, head, registry)
+    reader = registry.load(registry.find("reader", format)) if format else _sniffed(path, head, registry)
     with _reading(reader, path):
         found = reader.read(path)
     source = found if isinstance(found, Source) else _from_mapping(found, reader, path)
@@ -57,7 +57,7 @@ def open_source(path: Path, *, registry: Registry, format: str | None = None) ->
 
 def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
     """Return the reader of a file: one that goes by its ending alone, else the one whose test the first bytes pass."""
-    readers = [(entry, registry.reader(entry)) for entry in registry.entries("reader")]
+    readers = [(entry, registry.load(entry)) for entry in registry.entries("reader")]
     by_suffix = [(e, r) for e, r in readers if r.sniff is None and path.suffix.lower() in r.suffixes]
     found = by_suffix or [(e, r) for e, r in readers if r.sniff is not None and _passes(r.sniff, head)]
     if len(found) > 1:  # content alone does not decide: the ending does

@@ -31,8 +31,8 @@ from srfcli.laws.law_file import (
     COMMON,
     FORMULA,
     LAW_CLASSES,
+    check_law,
     check_parameters,
-    check_states,
     check_uses,
     known_symbols,
     valid_name,
@@ -156,12 +156,12 @@ def effect(
     holds, under the name of each, an `ExtraState`. `wrong` and `remedy` are what a report says where it is found.
     """
 
-    from srfcli.laws.effect_file import SCANNED_VALUES, SLOTS, check_names, finished, known_names
+    from srfcli.laws.effect_file import SCANNED_VALUES, SLOTS, TAKEN, finished, known_names
 
     def decorate(function: Callable[..., Any]) -> Effect:
         own = _name(function, name, "effect", "my-effect")
         listed, brought, needed = _parameter_list(parameters), tuple(states), tuple(needs)
-        check_names(listed)
+        check_parameters(listed, TAKEN)
         sizes = dict(neutral or {})
         known = (*known_names([p.name for p in listed], brought, needed), *SLOTS)
         changes, extra = _changes(function, [*(p.name for p in listed), *COMMON, *needed], known, brought)
@@ -199,8 +199,7 @@ def _decorator(
         law_name = _name(function, name, "law", "my-law")
         listed = _parameter_list(parameters)
         states = more.get("states", ())
-        check_parameters(listed, kind=kind, states=states)
-        check_states(states, listed)
+        check_law(kind, listed, states)
         known = known_symbols(kind, (p.name for p in listed), states)
         own = (*(COMMON if kind in ("ageing", "modifier") else ()), *(p.name for p in listed))
         variables = [n for n in known if n not in own] if kind != "ageing" else list(AGEING_SYMBOLS)

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import sympy
 
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
+from srfcli.core.toml import Node
 from srfcli.core.units import describe, dimension, dimension_of, find_unit
 from srfcli.laws.expression import check_identifier, parse_expression, symbol
-from srfcli.laws.law_file import AGEING_SYMBOLS, COMMON, LawReader, check_parameters
+from srfcli.laws.law_file import (
+    AGEING_SYMBOLS,
+    COMMON,
+    check_parameters,
+    placed,
+    read_checks,
+    read_formula,
+    read_kind,
+    read_name,
+    read_number,
+    read_numbers,
+    read_parameters,
+    read_texts,
+)
 from srfcli.laws.values import Effect, ExtraState
-
-if TYPE_CHECKING:
-    import sympy
 
 SLOTS = ("mu", "rate", "kappa", "W", "force", "V", "K", "gauge")
 PLACES = ("slip", "stage", "time", "theta", "envelope")  # unknowns and abbreviations that formulas of effects may hold
@@ -25,34 +39,17 @@ KEYS = (
 )  # fmt: skip
 MOST_VALUES = 1000  # values of an inner parameter
 SCANNED_VALUES = 8  # values at which an inner parameter is tried where its author says nothing
-_TAKEN = {*PLACES, *RUN_NAMES, *COMMON, "mu", "W", "v", "phi", "u", "kappa", "force", "gauge", "start", "begin"}
+TAKEN = {*PLACES, *RUN_NAMES, *COMMON, "mu", "W", "v", "phi", "u", "kappa", "force", "gauge", "start", "begin"}
 _OWN = ("neutral", "scan", "within", "typical", "fixed")  # keys of a parameter that an effect has and a law has not
-_PARAMETER = ("default", "unit", "lower", "upper", "bounds", "about", *_OWN)
 SCALES = {  # of a recording, which bounds and sizes may be stated in, with their units
     "segment": "um", "track": "um", "duration": "s", "interval": "s", "V_low": "um/s", "V_high": "um/s", "load": "N", "D0": "um",
     "V0": "um/s",
 }  # fmt: skip
-_CONSTANT = ("value", "unit", "about")
-_STATE = ("name", "rate", "steady", "logarithmic")
 
 
 def known_names(own: Iterable[str], states: Iterable[str] = (), needs: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the names that the formulas of an effect may hold, but for that of the slot itself."""
     return tuple(dict.fromkeys([*own, *states, *needs, *PLACES, *RUN_NAMES, *COMMON, *AGEING_SYMBOLS, "u", "gauge"]))
-
-
-def check_names(parameters: Sequence[Parameter], constants: Sequence[Parameter] = ()) -> None:
-    """Raise `SrfError` for a name, default, bound or unit that no parameter or constant of an effect may have."""
-    names: set[str] = set()
-    for p in (*parameters, *constants):
-        check_identifier(p.name, "parameter", taken=_TAKEN | names)
-        names.add(p.name)
-    for i, p in enumerate((*parameters, *constants)):
-        plain = f"own{i}"  # a drift's rate is called rate, a law's is not
-        try:
-            check_parameters([replace(p, name=plain)], kind="effect")
-        except SrfError as error:
-            raise SrfError(error.message.replace(plain, p.name), error.hint) from None
 
 
 def finished(effect: Effect) -> Effect:
@@ -70,7 +67,7 @@ def finished(effect: Effect) -> Effect:
     for name, value in effect.neutral:
         if name not in declared:
             raise SrfError(f"neutral value of '{name}', which is no parameter", did_you_mean(name, declared))
-        if not value == value or abs(value) == float("inf"):
+        if not math.isfinite(value):
             raise SrfError(f"the neutral value of '{name}' is {value}", "Give a finite number.")
     states = [state.name for state in effect.states]
     if effect.observed and effect.observed not in states:
@@ -79,8 +76,6 @@ def finished(effect: Effect) -> Effect:
 
 
 def _with_numbers(effect: Effect) -> Effect:
-    import sympy
-
     numbers = {symbol(c.name): sympy.Rational(repr(c.default * find_unit(c.unit).factor)) for c in effect.constants}
     return replace(
         effect,
@@ -101,143 +96,121 @@ def summary(effect: Effect) -> str:
 
 def formula_text(formula: sympy.Expr) -> str:
     """Return a formula as text, with long decimals as decimals."""
-    import sympy
-
     long = [r for r in formula.atoms(sympy.Rational) if r.q > 10**6]
     return str(formula.xreplace({r: sympy.Float(r) for r in long}))
 
 
-class EffectReader(LawReader):
-    """One TOML table on its way to an effect."""
+# From the table of a file to an effect.
 
-    def effect(self) -> Effect:
-        """Return the effect; SrfError with file and key for anything that is not one."""
-        self.keys("", self.table, KEYS)
-        self.kind()
-        parameters, constants = self.parameters(), self.constants()
-        with self.placed():
-            check_names(parameters, constants)
-        known = set(known_names((p.name for p in (*parameters, *constants)), self.state_names(), self.listed("needs")))
-        neutral, scans = self.sizes()
-        formulas = [*(slot for slot in SLOTS if slot in self.table), *self.state_names()]
-        given = sorted((known | {*SLOTS}) - {c.name for c in constants})
-        effect = Effect(
-            name=self.name(), parameters=parameters, about=self.text("about"), cites=self.listed("cites"), source=str(self.path),
-            changes=tuple((slot, self.slot(slot, known | {slot})) for slot in SLOTS if slot in self.table),
-            states=self.extra(known), settings=self.settings(), frees=self.listed("frees"), neutral=neutral, scans=scans,
-            needs=self.listed("needs"), lacks=self.listed("lacks"), observed=self.text("observed"),
-            constitutive=self.flag("constitutive", True), answers=self.text("answers"), constants=constants,
-            scaled=tuple(self.scaled(parameters)), on_request=self.flag("on_request", False),
-            fixed=tuple(n for n, e in self.table.get("parameters", {}).items() if e.get("fixed")),
-            wrong=self.text("wrong"), remedy=self.text("remedy"), checks=self.checks(formulas, given),
-        )  # fmt: skip
-        with self.placed():
-            return finished(effect)
 
-    def sizes(self) -> tuple[tuple[tuple[str, float], ...], tuple[tuple[str, int], ...]]:
-        """Return the neutral values of the sizes, and at how many values each other parameter is tried."""
-        neutral: list[tuple[str, float]] = []
-        scans: list[tuple[str, int]] = []
-        for name, entry in self.table.get("parameters", {}).items():
-            where = f"parameters.{name}"
-            if "neutral" in entry:
-                if "scan" in entry:
-                    self.fail(f"{where}.scan", "given together with neutral", "A size is fitted; only others are tried.")
-                if entry.get("fixed"):
-                    self.fail(f"{where}.fixed", "given together with neutral", "A size is fitted.")
-                neutral.append((name, self.number(f"{where}.neutral", entry["neutral"])))
-                continue
-            if entry.get("fixed"):
-                if "scan" in entry:
-                    self.fail(f"{where}.scan", "given together with fixed", "What is never fitted is tried at no values.")
-                continue
-            count = self.number(f"{where}.scan", entry.get("scan", SCANNED_VALUES))
+def effect_of(node: Node) -> Effect:
+    """Return the effect that a table holds."""
+    node.keys(KEYS)
+    read_kind(node)
+    parameters, constants = read_parameters(node, _OWN), node.read("constants", _constants, ())
+    entries = [node.child("parameters").child(p.name) for p in parameters]
+    for entry in entries:
+        entry.read("fixed", Node.boolean, False)
+    with placed(node):
+        check_parameters((*parameters, *constants), TAKEN)
+    states = node.read("states", _state_tables, [])
+    names = [str(state.value.get("name")) for state in states]
+    needs = node.read("needs", read_texts, ())
+    known = set(known_names((p.name for p in (*parameters, *constants)), names, needs))
+    neutral, scans = _sizes(entries)
+    changes = tuple((slot, read_formula(node.child(slot), known | {slot})) for slot in SLOTS if slot in node.value)
+    given = sorted((known | {*SLOTS}) - {c.name for c in constants})
+    told: dict[str, Any] = {key: node.read(key, Node.text, "") for key in ("about", "observed", "answers", "wrong", "remedy")}
+    told |= {key: node.read(key, read_texts, ()) for key in ("cites", "frees", "lacks")}
+    effect = Effect(
+        name=read_name(node), parameters=parameters, source=str(node.file), changes=changes, states=_extra_states(states, known),
+        settings=node.read("settings", _settings, ()), neutral=neutral, scans=scans, needs=needs,
+        constitutive=node.read("constitutive", Node.boolean, True), constants=constants,
+        scaled=tuple(found for p, entry in zip(parameters, entries, strict=True) for found in _scaled(p, entry)),
+        on_request=node.read("on_request", Node.boolean, False),
+        fixed=tuple(p.name for p, entry in zip(parameters, entries, strict=True) if entry.value.get("fixed")),
+        checks=read_checks(node, [*(slot for slot, _ in changes), *names], given), **told,
+    )  # fmt: skip
+    with placed(node):
+        return finished(effect)
+
+
+def _constants(node: Node) -> tuple[Parameter, ...]:
+    """Return the numbers with units that the formulas name."""
+    example = 'value = 7.0, unit = "N"'
+    return read_numbers(node.table(f"[constants] and Wref = {{ {example} }}."), "value", example, ("unit", "about"))
+
+
+def _sizes(entries: Iterable[Node]) -> tuple[tuple[tuple[str, float], ...], tuple[tuple[str, int], ...]]:
+    """Return the neutral values of the sizes, and at how many values each other parameter is tried."""
+    neutral: list[tuple[str, float]] = []
+    scans: list[tuple[str, int]] = []
+    for entry in entries:
+        name, size, scan = str(entry.place[-1]), entry.get("neutral"), entry.get("scan")
+        fixed = entry.value.get("fixed", False)
+        if scan and (size or fixed):
+            why = "A size is fitted; only others are tried." if size else "What is never fitted is tried at no values."
+            scan.fail(f"given together with {'neutral' if size else 'fixed'}", why)
+        if size:
+            if fixed:
+                entry.child("fixed").fail("given together with neutral", "A size is fitted.")
+            neutral.append((name, read_number(size)))
+        elif not fixed:
+            count = read_number(scan) if scan else float(SCANNED_VALUES)
             if not (count.is_integer() and 1 <= count <= MOST_VALUES):
-                self.fail(f"{where}.scan", f"found {count:g}, expected a whole number of values to try, up to {MOST_VALUES}")
+                entry.at("scan").fail(f"found {count:g}, expected a whole number of values to try, up to {MOST_VALUES}")
             scans.append((name, int(count)))
-        return tuple(neutral), tuple(scans)
+    return tuple(neutral), tuple(scans)
 
-    def scaled(self, parameters: Sequence[Parameter]) -> Iterator[tuple[str, str, sympy.Expr]]:
-        """Yield (parameter, lower, upper or default, formula) of what is stated in the scales of a recording."""
-        for p in parameters:
-            entry = self.table["parameters"][p.name]
-            within, where = entry.get("within"), f"parameters.{p.name}"
-            if within is not None and (not isinstance(within, list) or len(within) != 2):
-                self.fail(f"{where}.within", "expected two formulas", 'Write within = ["2.5*D0", "segment/2"].')
-            stated = [("lower", "within", within[0]), ("upper", "within", within[1])] if within is not None else []
-            stated += [("default", "typical", entry["typical"])] if "typical" in entry else []
-            for which, key, text in stated:
-                if not isinstance(text, str):
-                    self.fail(f"{where}.{key}", f"found {text!r}, expected a formula in quotes")
-                units = {name: dimension(unit) for name, unit in SCALES.items()}
-                with self.placed(f"{where}.{key}"):
-                    formula = parse_expression(text, SCALES)
-                    found, wanted = dimension_of(formula, units), dimension(p.unit)
-                if formula.free_symbols and found != wanted:
-                    self.fail(f"{where}.{key}", f"'{text}' is in {describe(found)}, {p.name} in {p.unit}")
-                yield p.name, which, formula
 
-    def parameter(self, name: str, entry: object, table: str = "parameters", value: str = "default") -> Parameter:
-        """Return one parameter, or one of the constants."""
-        if table == "constants":
-            node = self.at(f"{table}.{name}", entry).table(f'{name} = {{ value = 7.0, unit = "N" }}.')
-            self.keys(f"{table}.{name}", node.value, _CONSTANT)
-        elif isinstance(entry, dict):
-            self.keys(f"parameters.{name}", entry, _PARAMETER)
-            self.at(f"parameters.{name}.fixed", entry.get("fixed", False)).boolean()
-            entry = {k: v for k, v in entry.items() if k not in _OWN}
-        return super().parameter(name, entry, table, value)
+def _scaled(p: Parameter, entry: Node) -> Iterator[tuple[str, str, sympy.Expr]]:
+    """Yield (parameter, lower, upper or default, formula) of what is stated in the scales of a recording."""
+    stated = []
+    if within := entry.get("within"):
+        if not isinstance(within.value, list) or len(within.value) != 2:
+            within.fail("expected two formulas", 'Write within = ["2.5*D0", "segment/2"].')
+        stated = [(which, replace(within, value=text)) for which, text in zip(("lower", "upper"), within.value, strict=True)]
+    if typical := entry.get("typical"):
+        stated.append(("default", typical))
+    for which, node in stated:
+        if not isinstance(node.value, str):
+            node.fail(f"found {node.value!r}, expected a formula in quotes")
+        with placed(node):
+            formula = parse_expression(node.value, SCALES)
+            found = dimension_of(formula, {name: dimension(unit) for name, unit in SCALES.items()})
+        if formula.free_symbols and found != dimension(p.unit):
+            node.fail(f"'{node.value}' is in {describe(found)}, {p.name} in {p.unit}")
+        yield p.name, which, formula
 
-    def constants(self) -> tuple[Parameter, ...]:
-        """Return the numbers with units that the formulas name."""
-        table = self.at("constants", self.table.get("constants", {})).table('[constants] and Wref = { value = 7.0, unit = "N" }.')
-        return tuple(self.parameter(name, entry, "constants", "value") for name, entry in table.value.items())
 
-    def slot(self, slot: str, known: Iterable[str]) -> sympy.Expr:
-        """Return the formula of a slot."""
-        text = self.text(slot)
-        with self.placed(slot):
-            return parse_expression(text, known)
+def _state_tables(node: Node) -> list[Node]:
+    if not isinstance(node.value, list) or not all(isinstance(e, dict) for e in node.value):
+        node.fail("expected a list of tables", 'Write states = [{ name = "phi2", rate = "...", steady = "..." }].')
+    return [node.child(number) for number in range(len(node.value))]
 
-    def state_tables(self) -> list[Mapping[str, Any]]:
-        """Return the tables under `states`."""
-        entries = self.table.get("states", [])
-        if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
-            self.fail("states", "expected a list of tables", 'Write states = [{ name = "phi2", rate = "...", steady = "..." }].')
-        return entries
 
-    def state_names(self) -> list[str]:
-        """Return the names under `states`."""
-        return [str(entry.get("name")) for entry in self.state_tables()]
+def _extra_states(entries: Iterable[Node], known: set[str]) -> tuple[ExtraState, ...]:
+    """Return the unknowns that an effect brings."""
+    found: list[ExtraState] = []
+    for entry in entries:
+        entry.keys(("name", "rate", "steady", "logarithmic"))
+        for key in ("name", "rate", "steady"):
+            if not isinstance(entry.value.get(key), str):
+                entry.at(key).fail("missing, or not text in quotes")
+        logarithmic = entry.read("logarithmic", Node.boolean, False)
+        name = entry.value["name"]
+        with entry.blamed():
+            check_identifier(name, "state", taken=((known | {state.name for state in found}) - {name}) | TAKEN)
+            rate, steady = (parse_expression(entry.value[key], known) for key in ("rate", "steady"))
+        found.append(ExtraState(name, rate, steady, logarithmic))
+    return tuple(found)
 
-    def extra(self, known: set[str]) -> tuple[ExtraState, ...]:
-        """Return the unknowns that the effect brings."""
-        found: list[ExtraState] = []
-        for number, entry in enumerate(self.state_tables()):
-            where = f"states[{number}]"
-            self.keys(where, entry, _STATE)
-            for key in ("name", "rate", "steady"):
-                if not isinstance(entry.get(key), str):
-                    self.fail(f"{where}.{key}", "missing, or not text in quotes")
-            logarithmic = self.at(f"{where}.logarithmic", entry.get("logarithmic", False)).boolean()
-            taken = (known | {state.name for state in found}) - {entry["name"]}
-            try:
-                check_identifier(entry["name"], "state", taken=taken | _TAKEN)
-                rate, steady = (parse_expression(entry[key], known) for key in ("rate", "steady"))
-            except SrfError as error:
-                self.fail(where, error.message, error.hint)
-            found.append(ExtraState(entry["name"], rate, steady, logarithmic))
-        return tuple(found)
 
-    def settings(self) -> tuple[tuple[str, str | bool], ...]:
-        """Return the choices of the model that the effect replaces."""
-        table = self.at("settings", self.table.get("settings", {})).table('settings = { interface = "elastic" }.').value
-        self.keys("settings", table, ("interface", "inertia"))
-        for key, kind in (("interface", str), ("inertia", bool)):
-            if not isinstance(table.get(key, kind()), kind):
-                self.fail(f"settings.{key}", f"found {table[key]!r}", 'Write interface = "elastic" or inertia = true.')
-        return tuple(sorted(table.items()))
-
-    def flag(self, key: str, default: bool) -> bool:
-        """Return true or false."""
-        return self.at(key, self.table.get(key, default)).boolean()
+def _settings(node: Node) -> tuple[tuple[str, str | bool], ...]:
+    """Return the choices of the model that an effect replaces."""
+    table = node.table('settings = { interface = "elastic" }.').value
+    node.keys(("interface", "inertia"))
+    for key, kind in (("interface", str), ("inertia", bool)):
+        if not isinstance(table.get(key, kind()), kind):
+            node.child(key).fail(f"found {table[key]!r}", 'Write interface = "elastic" or inertia = true.')
+    return tuple(sorted(table.items()))

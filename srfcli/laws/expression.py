@@ -30,8 +30,8 @@ MAX_PLAIN = 100
 MAX_NAME = 32
 
 
-class log1p(sp.Function):  # small letters: the name is that in generated code
-    """log(1 + x), kept whole so that generated code calls np.log1p."""
+class _Whole(sp.Function):
+    """A function that is kept whole, so that generated code calls NumPy's; `plain` is the one that it is written out by."""
 
     nargs = 1
 
@@ -40,62 +40,45 @@ class log1p(sp.Function):  # small letters: the name is that in generated code
         """Fold the argument 0 and nothing else."""
         return sp.S.Zero if arg.is_zero else None
 
+    def _eval_evalf(self, prec: int) -> sp.Expr:
+        return self.rewrite(self.plain)._eval_evalf(prec)
+
+
+class log1p(_Whole):  # small letters: the name is that in generated code
+    """log(1 + x)."""
+
+    plain = sp.log
+
     def fdiff(self, argindex: int = 1) -> sp.Expr:
-        """Return the derivative 1/(1 + x)."""
         return 1 / (1 + self.args[0])
 
     def _eval_rewrite_as_log(self, arg: sp.Expr, **_kwargs: Any) -> sp.Expr:
         return sp.log(1 + arg)
 
-    def _eval_evalf(self, prec: int) -> sp.Expr:
-        return self.rewrite(sp.log)._eval_evalf(prec)
-
     def _eval_is_real(self) -> bool | None:
         return (1 + self.args[0]).is_positive or None
 
 
-class expm1(sp.Function):
-    """exp(x) - 1, kept whole so that generated code calls np.expm1."""
+class expm1(_Whole):
+    """exp(x) - 1."""
 
-    nargs = 1
-
-    @classmethod
-    def eval(cls, arg: sp.Expr) -> sp.Expr | None:
-        """Fold the argument 0 and nothing else."""
-        return sp.S.Zero if arg.is_zero else None
+    plain = sp.exp
 
     def fdiff(self, argindex: int = 1) -> sp.Expr:
-        """Return the derivative exp(x)."""
         return sp.exp(self.args[0])
 
     def _eval_rewrite_as_exp(self, arg: sp.Expr, **_kwargs: Any) -> sp.Expr:
         return sp.exp(arg) - 1
-
-    def _eval_evalf(self, prec: int) -> sp.Expr:
-        return self.rewrite(sp.exp)._eval_evalf(prec)
 
     def _eval_is_real(self) -> bool | None:
         return self.args[0].is_real
 
 
 # abs, min, max, floor are left out: a law must have derivatives, and complex-step must find them.
-FUNCTIONS: dict[str, Callable[..., Any]] = {
-    "exp": sp.exp,
-    "log": sp.log,
-    "ln": sp.log,
-    "log1p": log1p,
-    "expm1": expm1,
-    "sqrt": sp.sqrt,
-    "sin": sp.sin,
-    "cos": sp.cos,
-    "sinh": sp.sinh,
-    "cosh": sp.cosh,
-    "tanh": sp.tanh,
-    "asinh": sp.asinh,
-    "atan": sp.atan,
-    "lambertw": sp.LambertW,
-    "LambertW": sp.LambertW,
-}
+_NAMED = (
+    sp.exp, sp.log, log1p, expm1, sp.sqrt, sp.sin, sp.cos, sp.sinh, sp.cosh, sp.tanh, sp.asinh, sp.atan, sp.LambertW,
+)  # fmt: skip
+FUNCTIONS: dict[str, Callable[..., Any]] = {f.__name__: f for f in _NAMED} | {"ln": sp.log, "lambertw": sp.LambertW}
 _SMOOTH = "A formula has derivatives everywhere: tanh, sqrt and exp take its place."
 INSTEAD = {  # functions that a formula has not -> what to write
     "log10": "Write log(x)/log(10).", "log2": "Write log(x)/log(2).", **dict.fromkeys(("abs", "sign", "min", "max"), _SMOOTH)
@@ -448,14 +431,10 @@ class NumPyText(NumPyPrinter):
             return f"sqrt({self._print(base)})"
         return f"{self.parenthesize(base, 60)}**{self.parenthesize(exponent, 60)}"
 
-    def _print_log1p(self, expr: sp.Expr) -> str:
-        return f"log1p({self._print(expr.args[0])})"
+    def _print_called(self, expr: sp.Expr) -> str:
+        return f"{type(expr).__name__.lower()}({self._print(expr.args[0])})"
 
-    def _print_expm1(self, expr: sp.Expr) -> str:
-        return f"expm1({self._print(expr.args[0])})"
-
-    def _print_LambertW(self, expr: sp.Expr) -> str:
-        return f"lambertw({self._print(expr.args[0])})"
+    _print_log1p = _print_expm1 = _print_LambertW = _print_called
 
     def _print_lut(self, expr: sp.Expr) -> str:
         number, argument = expr.args

@@ -8,12 +8,12 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import CHECK_PATH, ExpressionError, SrfError, did_you_mean, shown
 from srfcli.core.files import parse_toml, read_text
@@ -43,9 +43,6 @@ LAW_CLASSES: dict[str, type[Law]] = {
 LAW_NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*", re.ASCII)
 
 _COMMON_KEYS = ("format", "kind", "name", "about", "cites", "parameters", "checks")
-_PARAMETER_KEYS = ("unit", "lower", "upper", "bounds", "about")
-_CHECK_KEYS = ("quantity", "at", "value", "rtol")
-_STATE_KEYS = ("name", "length", "weight")
 
 
 def kind_of(law: Law | Reader) -> str:
@@ -85,8 +82,8 @@ def open_law(path: Path) -> Node:
 
 def read_header(path: Path) -> tuple[str, str, str]:
     """Return kind, name and about of a law file without reading its formula."""
-    reader = LawReader(open_law(path))
-    return reader.kind(), reader.name(), reader.text("about")
+    node = open_law(path)
+    return read_kind(node), read_name(node), node.read("about", Node.text, "")
 
 
 def valid_name(name: object) -> bool:
@@ -94,16 +91,13 @@ def valid_name(name: object) -> bool:
     return isinstance(name, str) and len(name) <= 64 and LAW_NAME.fullmatch(name) is not None
 
 
-def check_parameters(parameters: Iterable[Parameter], *, kind: str, states: Iterable[State] = ()) -> None:
-    """Raise `SrfError` for a name, default, bound or unit that no law may have."""
+def check_parameters(parameters: Iterable[Parameter], taken: Iterable[str]) -> None:
+    """Raise `SrfError` for a name, which must be none of `taken`, a default, bound or unit that no parameter may have."""
     from srfcli.laws.expression import check_identifier
 
-    names: set[str] = set()
-    taken = {*VARIABLES, *(state.name for state in states)}
-    if kind in ("ageing", "modifier"):
-        taken |= set(COMMON)  # they come from the friction law, and one default is enough
+    names = {*taken}
     for p in parameters:
-        check_identifier(p.name, "parameter", taken=taken | names)
+        check_identifier(p.name, "parameter", taken=names)
         names.add(p.name)
         if not math.isfinite(p.default):
             raise SrfError(f"parameter '{p.name}': the default is {p.default}", "Give a finite number.")
@@ -118,17 +112,22 @@ def check_parameters(parameters: Iterable[Parameter], *, kind: str, states: Iter
             raise SrfError(f"parameter '{p.name}': {error.message}", error.hint) from None
 
 
-def check_states(states: Iterable[State], parameters: Iterable[Parameter]) -> None:
-    """Raise `SrfError` unless each state has its own name and names parameters for its length and weight."""
+def check_law(kind: str, parameters: Sequence[Parameter], states: Sequence[State]) -> None:
+    """Raise `SrfError` for parameters that no law of `kind` may have.
+
+    And unless each state has its own name and names parameters for its length and weight.
+    """
     from srfcli.laws.expression import check_identifier
 
+    # those of the friction law that an ageing law may name come from there, and one default is enough
+    common = COMMON if kind in ("ageing", "modifier") else ()
+    check_parameters(parameters, (*VARIABLES, *(state.name for state in states), *common))
     names = {p.name for p in parameters}
     seen: set[str] = set()
     for state in states:
         check_identifier(state.name, "state", taken=seen | (set(VARIABLES) - {"phi"}))
         seen.add(state.name)
-        for role in ("length", "weight"):
-            value = getattr(state, role)
+        for role, value in (("length", state.length), ("weight", state.weight)):
             if value not in names:
                 raise SrfError(
                     f"state '{state.name}': {role} '{value}' is not a parameter of this law", did_you_mean(value, names)
@@ -145,182 +144,158 @@ def check_uses(law: Law) -> None:
             raise SrfError(f"mu does not depend on '{name}'", "A friction law depends on v and on each of its states.")
 
 
-class LawReader:
-    """One TOML table on its way to a law."""
+# From the table of a file to a law; a fault is told with its place.
 
-    def __init__(self, node: Node) -> None:
-        self.node, self.path, self.table = node, node.file, node.value
 
-    def at(self, key: str, value: object = None) -> Node:
-        """Return the place of a key, as parameters.A.default or states[0], with a value."""
-        place = tuple(int(number) if number else name for number, name in re.findall(r"\[(\d+)\]|([^.\[\]]+)", key))
-        return replace(self.node, value=value, place=place)
+def law_of(node: Node) -> Law:
+    """Return the law that a table holds."""
+    kind = read_kind(node)
+    key = FORMULA[kind]
+    node.keys((*_COMMON_KEYS, key, *(("states",) if kind == "friction" else ())))
+    name, about = read_name(node), node.read("about", Node.text, "")
+    cites, parameters = node.read("cites", read_texts, ()), read_parameters(node)
+    states = node.read("states", _states, (State(),)) if kind == "friction" else ()
+    with placed(node):
+        check_law(kind, parameters, states)
+    known = known_symbols(kind, (p.name for p in parameters), states)
+    checks = read_checks(node, (key,), known)
+    own: dict[str, Any] = {"states": states} if states else {}
+    if key in node.value or kind != "interface":  # one without a formula is rigid
+        misplaced = key in node.value.get("parameters", {})
+        hint = "It stands below [parameters]; move it above the first [table]." if misplaced else ""
+        own[key] = read_formula(node.require(key, hint or f'Give the formula as text: {key} = "...".'), known)
+    source = str(node.file)
+    law = LAW_CLASSES[kind](name=name, parameters=parameters, about=about, cites=cites, checks=checks, source=source, **own)
+    with placed(node):
+        check_uses(law)
+    return law
 
-    def fail(self, key: str, message: str, hint: str | None = None) -> NoReturn:
-        self.at(key).fail(message, hint)
 
-    @contextlib.contextmanager
-    def placed(self, key: str = "") -> Iterator[None]:
-        """Write the file, and the key, in front of an error that is raised inside."""
-        try:
-            yield
-        except ExpressionError as error:
-            told = f"{self.at(key).where}: {error.message}"
-            raise ExpressionError(told, error.hint, text=error.text, column=error.column) from None
-        except SrfError as error:
-            self.fail(key, error.message, error.hint)
+@contextlib.contextmanager
+def placed(node: Node) -> Iterator[None]:
+    """Write the place of a node in front of an error that is raised inside; the caret of a formula stays."""
+    try:
+        yield
+    except ExpressionError as error:
+        raise ExpressionError(f"{node.where}: {error.message}", error.hint, text=error.text, column=error.column) from None
+    except SrfError as error:
+        node.fail(error.message, error.hint)
 
-    def keys(self, where: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
-        self.at(where, table).keys(known)
 
-    def text(self, key: str, default: str = "") -> str:
-        return self.at(key, self.table.get(key, default)).text()
+def read_kind(node: Node) -> str:
+    """Return the kind of a law, which its table says after the format."""
+    known = (*LAW_KINDS, "effect")
+    found, kind = node.at("format"), node.at("kind")
+    if found.value != FORMAT:
+        said = "nothing" if found.value is None else shown(found.value)
+        found.fail(f"found {said}, expected {FORMAT!r}", f'Start the file with format = "{FORMAT}".')
+    if kind.value not in known:
+        said = "nothing" if kind.value is None else shown(kind.value)
+        kind.fail(f"found {said}, expected one of {', '.join(known)}", did_you_mean(str(kind.value), known))
+    return kind.value
 
-    def number(self, where: str, value: object) -> float:
-        node = self.at(where, value)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            node.expected("a number")
-        try:
-            return float(value)
-        except OverflowError:
-            node.fail(f"found {shown(value)}, which is too large", "Write it as in 1e300, or inf.")
 
-    def kind(self) -> str:
-        found = self.table.get("format")
-        if found != FORMAT:
-            said = "nothing" if found is None else shown(found)
-            self.fail("format", f"found {said}, expected {FORMAT!r}", f'Start the file with format = "{FORMAT}".')
-        kind = self.table.get("kind")
-        known = (*LAW_KINDS, "effect")
-        if kind not in known:
-            said = "nothing" if kind is None else shown(kind)
-            self.fail("kind", f"found {said}, expected one of {', '.join(known)}", did_you_mean(str(kind), known))
-        return kind
+def read_name(node: Node) -> str:
+    """Return the name of a law, that of its file where the table has none."""
+    name = node.read("name", Node.text, node.file.stem)
+    if not valid_name(name):
+        replace(node.at("name"), value=name).expected("small letters, digits and single dashes", "Like my-law.")
+    return name
 
-    def name(self) -> str:
-        name = self.text("name", self.path.stem)
-        if not valid_name(name):
-            self.at("name", name).expected("small letters, digits and single dashes", "Like my-law.")
-        return name
 
-    def law(self) -> Law:
-        kind = self.kind()
-        key = FORMULA[kind]
-        self.keys("", self.table, (*_COMMON_KEYS, key, *(("states",) if kind == "friction" else ())))
-        common: dict[str, Any] = {
-            "name": self.name(),
-            "about": self.text("about"),
-            "cites": self.listed("cites"),
-            "parameters": self.parameters(),
-            "source": str(self.path),
-        }
-        if kind == "friction":
-            common["states"] = self.states()
-        states = common.get("states", ())
-        with self.placed():
-            check_parameters(common["parameters"], kind=kind, states=states)
-            check_states(states, common["parameters"])
-        names = known_symbols(kind, (p.name for p in common["parameters"]), states)
-        common["checks"] = self.checks((key,), names)
-        common[key] = self.formula(key, kind, names)
-        law = LAW_CLASSES[kind](**common)
-        with self.placed():
-            check_uses(law)
-        return law
+def read_number(node: Node) -> float:
+    """Return a number, which may be infinite."""
+    if isinstance(node.value, bool) or not isinstance(node.value, int | float):
+        node.expected("a number")
+    try:
+        return float(node.value)
+    except OverflowError:
+        node.fail(f"found {shown(node.value)}, which is too large", "Write it as in 1e300, or inf.")
 
-    def formula(self, key: str, kind: str, names: tuple[str, ...]) -> sympy.Expr | None:
-        from srfcli.laws.expression import parse_expression
 
-        if key not in self.table:
-            if kind == "interface":
-                return None  # rigid
-            hint = f'Give the formula as text: {key} = "...".'
-            if key in self.table.get("parameters", {}):
-                hint = "It stands below [parameters]; move it above the first [table]."
-            self.fail(key, "missing", hint)
-        text = self.text(key)
-        with self.placed(key):
-            return parse_expression(text, names)
+def read_texts(node: Node) -> tuple[str, ...]:
+    """Return a list of texts."""
+    if not isinstance(node.value, list) or not all(isinstance(text, str) for text in node.value):
+        node.expected("a list of texts")
+    return tuple(node.value)
 
-    def listed(self, key: str) -> tuple[str, ...]:
-        """Return a list of texts."""
-        value = self.table.get(key, [])
-        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-            self.at(key, value).expected("a list of texts")
-        return tuple(value)
 
-    def parameters(self) -> tuple[Parameter, ...]:
-        table = self.table.get("parameters", {})
-        if not isinstance(table, dict):
-            self.at("parameters", table).expected("a table", "Write [parameters].")
-        return tuple(self.parameter(name, entry) for name, entry in table.items())
+def read_formula(node: Node, known: Iterable[str]) -> sympy.Expr:
+    """Return the formula in the text at a node, in symbols of the names `known`."""
+    from srfcli.laws.expression import parse_expression
 
-    def parameter(self, name: str, entry: object, table: str = "parameters", value: str = "default") -> Parameter:
-        where = f"{table}.{name}"
-        if not isinstance(entry, dict):
-            if name in (*_COMMON_KEYS, *FORMULA.values(), "states"):
-                self.fail(where, "this key stands below [parameters]", "Move it above the first [table].")
-            self.at(where, entry).expected("a table", f'Write {name} = {{ default = 1.0, unit = "1" }}.')
-        self.keys(where, entry, (value, *_PARAMETER_KEYS))
-        if value not in entry:
-            self.fail(f"{where}.{value}", "missing", f"Write {name} = {{ {value} = 1.0 }}.")
-        for key in ("unit", "about"):
-            if not isinstance(entry.get(key, ""), str):
-                self.at(f"{where}.{key}", entry[key]).expected("text in quotes")
-        lower, upper = self.bounds(where, entry)
-        default = self.number(f"{where}.{value}", entry[value])
-        return Parameter(name, default, entry.get("unit", "1"), lower, upper, entry.get("about", ""))
+    text = node.text()
+    with placed(node):
+        return parse_expression(text, known)
 
-    def bounds(self, where: str, entry: Mapping[str, Any]) -> tuple[float, float]:
-        if "bounds" not in entry:
-            lower = self.number(f"{where}.lower", entry.get("lower", -math.inf))
-            return lower, self.number(f"{where}.upper", entry.get("upper", math.inf))
-        bounds = entry["bounds"]
-        if "lower" in entry or "upper" in entry:
-            self.fail(f"{where}.bounds", "given together with lower or upper", "Keep one of the two forms.")
-        if not isinstance(bounds, list) or len(bounds) != 2:
-            self.at(f"{where}.bounds", bounds).expected("[lower, upper]", "inf and -inf are numbers.")
-        return self.number(f"{where}.bounds", bounds[0]), self.number(f"{where}.bounds", bounds[1])
 
-    def states(self) -> tuple[State, ...]:
-        entries = self.table.get("states", [{}])
-        if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
-            self.fail("states", f'found {shown(entries)}, expected [{{ name = "phi", length = "D0", weight = "B" }}]')
-        states = []
-        for number, entry in enumerate(entries):
-            where = f"states[{number}]"
-            self.keys(where, entry, _STATE_KEYS)
-            if not all(isinstance(value, str) for value in entry.values()):
-                self.at(where, entry).expected("texts for name, length and weight")
-            states.append(State(**entry))
-        return tuple(states)
+def read_parameters(node: Node, keys: Iterable[str] = ()) -> tuple[Parameter, ...]:
+    """Return the parameters in a law's table, which may have these keys besides the usual ones."""
+    if (table := node.get("parameters")) is None:
+        return ()
+    for name, entry in table.table("[parameters].").value.items():
+        if not isinstance(entry, dict) and name in (*_COMMON_KEYS, *FORMULA.values(), "states"):
+            table.child(name).fail("this key stands below [parameters]", "Move it above the first [table].")
+    return read_numbers(table, "default", 'default = 1.0, unit = "1"', ("unit", "lower", "upper", "bounds", "about", *keys))
 
-    def checks(self, quantities: Sequence[str], names: Iterable[str]) -> tuple[Check, ...]:
-        """Return the worked values; a formula that is not named is the first of `quantities`."""
-        entries = self.table.get("checks", [])
-        if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
-            self.at("checks", entries).expected("tables", "Write [[checks]] with two brackets.")
-        if entries and not quantities:
-            self.fail("checks", "there is no formula to check", "Leave them out.")
-        return tuple(self.check(f"checks[{i}]", entry, quantities, names) for i, entry in enumerate(entries))
 
-    def check(self, where: str, entry: Mapping[str, Any], quantities: Sequence[str], names: Iterable[str]) -> Check:
-        """Return one worked value."""
-        self.keys(where, entry, _CHECK_KEYS)
-        for key in ("at", "value"):
-            if key not in entry:
-                self.fail(f"{where}.{key}", "missing")
-        quantity = entry.get("quantity", quantities[0])
+def read_numbers(table: Node, key: str, example: str, others: Iterable[str]) -> tuple[Parameter, ...]:
+    """Return numbers with units as parameters: each has a table with its number under `key` and, if need be, with `others`."""
+    found = []
+    for name in table.value:
+        entry = table.child(name).table(f"{name} = {{ {example} }}.")
+        entry.keys((key, *others))
+        number = entry.require(key, f"Write {name} = {{ {key} = 1.0 }}.")
+        unit, about = entry.read("unit", Node.text, "1"), entry.read("about", Node.text, "")
+        lower, upper = _bounds(entry)
+        found.append(Parameter(name, read_number(number), unit, lower, upper, about))
+    return tuple(found)
+
+
+def _bounds(entry: Node) -> tuple[float, float]:
+    if (pair := entry.get("bounds")) is None:
+        return entry.read("lower", read_number, -math.inf), entry.read("upper", read_number, math.inf)
+    if entry.value.keys() & {"lower", "upper"}:
+        pair.fail("given together with lower or upper", "Keep one of the two forms.")
+    if not isinstance(pair.value, list) or len(pair.value) != 2:
+        pair.expected("[lower, upper]", "inf and -inf are numbers.")
+    lower, upper = (read_number(replace(pair, value=bound)) for bound in pair.value)
+    return lower, upper
+
+
+def _states(node: Node) -> tuple[State, ...]:
+    entries = node.value
+    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+        node.fail(f'found {shown(entries)}, expected [{{ name = "phi", length = "D0", weight = "B" }}]')
+    for number, entry in enumerate(entries):
+        node.child(number).keys(("name", "length", "weight"))
+        if not all(isinstance(value, str) for value in entry.values()):
+            node.child(number).expected("texts for name, length and weight")
+    return tuple(State(**entry) for entry in entries)
+
+
+def read_checks(node: Node, quantities: Sequence[str], names: Sequence[str]) -> tuple[Check, ...]:
+    """Return the worked values of a law; a formula that is not named is the first of `quantities`."""
+    if (entries := node.get("checks")) is None:
+        return ()
+    if not isinstance(entries.value, list) or not all(isinstance(e, dict) for e in entries.value):
+        entries.expected("tables", "Write [[checks]] with two brackets.")
+    if entries.value and not quantities:
+        entries.fail("there is no formula to check", "Leave them out.")
+    found = []
+    for entry in map(entries.child, range(len(entries.value))):
+        entry.keys(("quantity", "at", "value", "rtol"))
+        at, value = entry.require("at"), entry.require("value")
+        quantity = entry.value.get("quantity", quantities[0])
         if quantity not in quantities:
-            found, wanted = shown(quantity), " or ".join(repr(q) for q in quantities)
-            self.fail(f"{where}.quantity", f"found {found}, expected {wanted}", did_you_mean(found, quantities))
-        if not isinstance(entry["at"], dict):
-            self.fail(f"{where}.at", f"found {shown(entry['at'])}, expected {{ v = 1.0, ... }}")
-        self.keys(f"{where}.at", entry["at"], tuple(names))
-        at = tuple((name, self.number(f"{where}.at.{name}", value)) for name, value in entry["at"].items())
-        value = self.number(f"{where}.value", entry["value"])
-        rtol = self.number(f"{where}.rtol", entry.get("rtol", Check.rtol))
-        return Check(quantity, at, value, rtol)
+            said, wanted = shown(quantity), " or ".join(repr(q) for q in quantities)
+            entry.child("quantity").fail(f"found {said}, expected {wanted}", did_you_mean(said, quantities))
+        if not isinstance(at.value, dict):
+            at.fail(f"found {shown(at.value)}, expected {{ v = 1.0, ... }}")
+        at.keys(names)
+        given = tuple((name, read_number(at.child(name))) for name in at.value)
+        found.append(Check(quantity, given, read_number(value), entry.read("rtol", read_number, Check.rtol)))
+    return tuple(found)
 
 
 def template(kind: str, name: str, *, python: bool) -> str:

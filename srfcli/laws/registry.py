@@ -25,7 +25,7 @@ from srfcli.core.cache import header_key, known_headers, user_base
 from srfcli.core.errors import CHECK_PATH, SrfError, did_you_mean
 from srfcli.core.files import check_plain, open_plain, read_plain
 from srfcli.core.settings import Parameter
-from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, open_law, read_header, valid_name
+from srfcli.laws.law_file import PLUGIN_KINDS, kind_of, law_of, open_law, read_header, read_parameters, valid_name
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, Law, Reader
 
 GROUP = "srf.laws"
@@ -122,17 +122,13 @@ class Registry:
         if name.endswith(".py") and not self._trust and _resolved(Path(name)) not in self._own:
             raise SrfError(f"'{name}' is Python code, which a file may not have run", untrusted_hint(name))
 
-    def load(self, entry: Entry) -> Law:
-        """Return the law of an entry, imported or parsed at the first call."""
+    def load(self, entry: Entry) -> Any:
+        """Return the law or the reader of an entry, imported or parsed at the first call."""
         if entry.origin == BUNDLED:
             return _shipped(entry)
         if entry not in self._loaded:
             self._loaded[entry] = read_entry(entry)
         return self._loaded[entry]
-
-    def reader(self, entry: Entry) -> Reader:
-        """Return the reader of an entry, imported at the first call."""
-        return self.load(entry)  # type: ignore[return-value]
 
     def ageing(self, spelling: str) -> tuple[AgeingLaw, tuple[AgeingModifier, ...]]:
         """Return the ageing law and the modifiers of a spelling such as `dieterich+linker-dieterich`."""
@@ -153,7 +149,7 @@ class Registry:
         if not name.endswith((".toml", ".py")):
             entry = self.find(kind, name)
             if entry.origin == BUNDLED and entry.location.suffix == ".toml":
-                return LawReader(open_law(entry.location)).parameters()
+                return read_parameters(open_law(entry.location))
         return self.get(kind, name).parameters
 
     def fingerprint(self, entry: Entry) -> str:
@@ -253,8 +249,8 @@ def _bundled() -> _Collector:
 
 
 @functools.cache
-def _shipped(entry: Entry) -> Law:
-    """Return the law of a shipped file, read once in a process."""
+def _shipped(entry: Entry) -> Any:
+    """Return the law or reader of a shipped file, read once in a process."""
     return read_entry(entry)
 
 
@@ -287,10 +283,10 @@ def read_law(path: Path) -> Law:
     """Return the law, or the effect, in a TOML file; its `kind` says which reader it needs."""
     node = open_law(path)
     if node.value.get("kind") == "effect":
-        from srfcli.laws.effect_file import EffectReader  # imports sympy
+        from srfcli.laws.effect_file import effect_of  # imports sympy
 
-        return EffectReader(node).effect()
-    return LawReader(node).law()
+        return effect_of(node)
+    return law_of(node)
 
 
 @contextlib.contextmanager
