@@ -20,7 +20,6 @@ from srfcli.core.units import (
     NO_GEOMETRY,
     Geometry,
     find_unit,
-    is_stress,
     parse_quantity,
     split_heading,
     split_quantity,
@@ -58,23 +57,26 @@ NAMED = {  # role -> what headings call it, in small letters without their unit;
         "fnorm",
     ),
 }  # fmt: skip
-WORDS = {  # role -> words of a heading that mean it, where no heading is one of NAMED, and units that such a column has
-    "time": ({"time", "elapsed", "clock", "timestamp"}, {"s"}),
-    "load_point_velocity": (
-        {"velocity", "vel", "speed", "rate", "rpm", "sliding", "v", "vs", "rotation", "angular"}, {"um/s", "rad/s", "1/s"},
-    ),
-    "load_point_displacement": (
-        {"displacement", "disp", "displ", "position", "pos", "stroke", "slip", "distance", "travel", "angle", "rotation",
-         "theta", "strain", "lp", "lpd", "ram", "stage", "sliding", "x", "gamma"}, {"um", "rad", "1"},
-    ),
-    "normal_stress": (
-        {"normal", "norm", "effective", "sn", "seff", "sigman", "sigma", "fn", "fz", "load", "axial", "weight"}, {"MPa", "N"},
-    ),
-    "shear_stress": (
-        {"shear", "friction", "frictional", "tangential", "traction", "lateral", "tau", "drag", "ft", "fx", "ff", "fs",
-         "torque", "moment"}, {"MPa", "N", "N*um"},
-    ),
-    "friction": ({"friction", "mu", "cof", "coefficient", "coeff"}, {"1"}),
+WORDS = {  # role -> words of a heading that mean it, where no heading is one of NAMED
+    "time": {"time", "elapsed", "clock", "timestamp"},
+    "load_point_velocity": {"velocity", "vel", "speed", "rate", "rpm", "sliding", "v", "vs", "rotation", "angular"},
+    "load_point_displacement": {
+        "displacement", "disp", "displ", "position", "pos", "stroke", "slip", "distance", "travel", "angle", "rotation", "theta",
+        "strain", "lp", "lpd", "ram", "stage", "sliding", "x", "gamma",
+    },
+    "normal_stress": {
+        "normal", "norm", "effective", "sn", "seff", "sigman", "sigma", "fn", "fz", "load", "axial", "weight",
+    },
+    "shear_stress": {
+        "shear", "friction", "frictional", "tangential", "traction", "lateral", "tau", "drag", "ft", "fx", "ff", "fs", "torque",
+        "moment",
+    },
+    "friction": {"friction", "mu", "cof", "coefficient", "coeff"},
+}  # fmt: skip
+KINDS = {  # role -> kinds of units that a column called so has
+    "time": {"s"}, "load_point_velocity": {"um/s", "rad/s", "1/s"}, "load_point_displacement": {"um", "rad", "1"},
+    "normal_load": {"N"}, "normal_stress": {"MPa", "N"}, "force": {"N", "N*um"}, "shear_stress": {"MPa", "N", "N*um"},
+    "friction": {"1"}, "elongation": {"um"},
 }  # fmt: skip
 ALONE = {"time": {"s"}, "load_point_velocity": {"um/s", "rad/s"}, "shear_stress": {"N*um"}}  # units that tell a role alone
 ASIDE = {"thickness", "gap", "height", "dilation", "dilatancy", "compaction", "depth", "pore", "confining", "temperature", "temp",
@@ -84,8 +86,8 @@ UNIT_SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
     "um_s": "um/s", "mm_s": "mm/s", "um/s": "um/s", "mm/s": "mm/s", "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "pa": "Pa",
     "n": "N", "kn": "kN", "un": "uN", "mn": "mN", "deg": "deg", "rad": "rad", "rpm": "rpm",
 }  # fmt: skip
-STRESSES = {"normal_load": "normal_stress", "force": "shear_stress"}
-FORCE_OF_STRESS = {stress: force for force, stress in STRESSES.items()}
+STRESS_OF = {"normal_load": "normal_stress", "force": "shear_stress", "friction": "shear_stress"}
+FORCE_OF = {"normal_stress": "normal_load", "shear_stress": "force", "friction": "force"}
 OBSERVED = ("elongation", "force", "shear_stress", "friction")
 MISREAD = ("friction", "drive-smoothed")  # kinds of notices that mean that the file was misread, or is not what it seems
 NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
@@ -115,7 +117,8 @@ NO_MASS = '# mass = "2.37 kg"   # of the slider; without it the slider is quasi-
 class Wish:
     """What the user says of data files: texts as experiment.toml has them, None or empty where nothing is said.
 
-    `columns` maps a role to a heading, or to `heading [unit]`; `drive` holds (duration, velocity) pairs or one velocity in um/s.
+    `stiffness` has a unit. `columns` maps a role to a heading, or to `heading [unit]`; `drive` holds (duration, velocity) pairs
+    or one velocity in um/s.
     """
 
     stiffness: str
@@ -214,21 +217,21 @@ def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
     units_of = {h: "1" if unit is None and "strain" in words[h] else unit for h, unit in units_of.items()}
     kinds = {h: _kind_of_unit(unit) for h, unit in units_of.items()}
     free = [h for h in kinds if not words[h] & ASIDE]
-    for role, (known, units) in WORDS.items():
+    for role, known in WORDS.items():
         if role in found or any(role in same and {*same} & found.keys() for same in (DRIVES, LOADS, OBSERVED)):
             continue  # it, or another that makes it needless, is found already
         # a unit that is not told will do for a role that is told by a number without one
-        fit = [h for h in free if kinds[h] in units or (kinds[h] == "" and role == "time")]
+        fit = [h for h in free if kinds[h] in KINDS[role] or (kinds[h] == "" and role == "time")]
         score = {h: len(words[h] & known) for h in fit}
         if role == "normal_stress":  # a normal displacement is told by its unit, a shear stress by its word
-            score = {h: 0 if words[h] & WORDS["shear_stress"][0] else n for h, n in score.items()}
+            score = {h: 0 if words[h] & WORDS["shear_stress"] else n for h, n in score.items()}
         best = max(score.values(), default=0)
         named = [h for h in fit if score[h] == best > 0]
         if not best and role in ALONE:
             named = [h for h in fit if kinds[h] in ALONE[role]]
         if len(named) == 1:
             heading = named[0]
-            actual = FORCE_OF_STRESS.get(role, role) if kinds[heading] in ("N", "N*um") else role
+            actual = _as_force(role, kinds[heading])
             found[actual] = Named(actual, heading, units_of[heading] or ROLES[actual], True, units_of[heading] is None)
             free.remove(heading)
 
@@ -252,8 +255,7 @@ def _wished(role: str, text: str, headings: Sequence[str], path: Path, geometry:
         raise SrfError(f"{path} has no column '{name}'", did_you_mean(name, headings))
     told = unit or _spelled(heading)[1]
     found = told or ROLES[role]
-    if role == "friction" and _kind_of_unit(found) in ("N", "N*um", "MPa"):
-        role = "shear_stress" if _kind_of_unit(found) == "MPa" else "force"
+    role = _as_force(role, _kind_of_unit(found)) if role == "friction" else role
     check_unit(found, role, where=f"`columns` {role}", geometry=geometry)
     return Named(role, heading, found, True, told is None)
 
@@ -277,21 +279,14 @@ def _by_unit(role: str, unit: str | None) -> str | None:
     """Return the role that a column with this unit plays, None where the unit fits no such role."""
     if unit is None:
         return role
-    try:
-        stress = is_stress(unit)
-    except SrfError:
-        return None
-    role = STRESSES.get(role, role) if stress else FORCE_OF_STRESS.get(role, role) if find_unit(unit).powers[2] else role
-    if role == "friction" and _kind_of_unit(unit) in ("N", "N*um", "MPa"):
-        return "shear_stress" if stress else "force"
-    turned = {"load_point_displacement": ("rad", "1"), "load_point_velocity": ("rad/s", "1/s"), "force": ("N*um",)}
-    if _kind_of_unit(unit) in turned.get(role, ()):
-        return role
-    try:
-        check_unit(unit, role)
-    except SrfError:
-        return None
-    return role
+    kind = _kind_of_unit(unit)
+    actual = _as_force(role, kind)
+    return actual if kind in KINDS[actual] else None
+
+
+def _as_force(role: str, kind: str) -> str:
+    """Return the role of a column whose unit is of this kind: a stress may be called a force or friction, a force a stress."""
+    return STRESS_OF.get(role, role) if kind == "MPa" else FORCE_OF.get(role, role) if kind in ("N", "N*um") else role
 
 
 def missing(
@@ -346,11 +341,11 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
 
     Raises SrfError for what the files do not say and `wish` neither, and for all that reading an experiment refuses.
     """
-    unit = split_quantity(wish.stiffness, name="`stiffness`", example="5e-3 1/um")[1]
-    per_load = bool(unit) and find_unit(unit).powers == (-1, 0, 0, 0)
+    unit = split_quantity(wish.stiffness, name="`stiffness`")[1]
+    per_load = find_unit(unit).powers == (-1, 0, 0, 0)
     geometry = wish.geometry()
     try:
-        unit_factor(unit or "N/um", "1/um" if per_load else "N/um", geometry)
+        unit_factor(unit, "1/um" if per_load else "N/um", geometry)
     except SrfError as error:
         hint = error.hint if error.kind == "unit" else "As '0.21 N/um', '1.5 MPa/mm' or '1e-3 1/um'."
         raise SrfError(f"`stiffness` '{wish.stiffness}': {error.message}", hint) from error

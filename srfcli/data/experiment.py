@@ -309,29 +309,32 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
     read = Run(
         name=run.name, file=run.file, holdout=run.holdout, start=run.start, initial=run.initial, t=t, observed=observed,
         observable=role, used=used, drive=drive, load=load, stiffness=stiffness, modulation=run.modulation, quantum=quantum,
-        notices=(*notices, *told, *weighed, *flaws), stress=any(units.values()), proposed=proposed, others=tuple(others),
-        backward=run.backward, segments=run.segments,
+        notices=(), stress=any(units.values()), proposed=proposed, others=tuple(others), backward=run.backward,
+        segments=run.segments,
     )  # fmt: skip
+    notices += [*told, *weighed, *flaws]
     if run.drive is None and columns.role("load_point_velocity") is not None:
-        read = replace(read, notices=(*read.notices, *_late_steps(read, columns.place("load_point_velocity").column)))
+        notices += _late_steps(read, columns.place("load_point_velocity").column)
     if run.modulation is None and (recorded_load := columns.role(*LOADS)) is not None:
-        read = replace(read, notices=(*read.notices, *_load_steps(read, columns.place(recorded_load).column)))
-    if not used.any():
-        return read
-    where, friction = columns.place(role).column, float(np.median(read.friction[used]))
-    if not np.ptp(observed[used]):
-        read = replace(read, notices=(*read.notices, Notice("constant", where, f"all readings are {observed[used][0]:g}")))
-    mu, usual = read.friction[used], 0.5 * float(np.median(np.abs(read.friction[used])))
-    if min(np.mean(mu > usual), np.mean(mu < -usual)) > BOTH_WAYS:
+        notices += _load_steps(read, columns.place(recorded_load).column)
+    return replace(read, notices=(*notices, *_odd_friction(read, columns.place(role).column)))
+
+
+def _odd_friction(run: Run, where: str) -> list[Notice]:
+    """Return notices of readings that are all the same, and of friction that surfaces which slide in contact do not have."""
+    readings, mu = run.observed[run.used], run.friction[run.used]
+    told = [] if np.ptp(readings) else [Notice("constant", where, f"all readings are {readings[0]:g}")]
+    friction, half = float(np.median(mu)), 0.5 * float(np.median(np.abs(mu)))
+    if min(np.mean(mu > half), np.mean(mu < -half)) > BOTH_WAYS:
         what = "the observable has both signs, and a run slides in one direction: `srf new` writes a run for each stroke"
-        return replace(read, notices=(*read.notices, Notice("friction", where, what)))
-    if LEAST_FRICTION < friction < LARGEST_FRICTION:
-        return read
-    asked = "are the units of what is observed, of load and stiffness right?"
-    if friction < -LEAST_FRICTION:
-        asked = 'where the slider is sheared backward, direction = "backward" in the run says so'
-    what = f"the friction coefficient is {friction:.3g}: {asked}"
-    return replace(read, notices=(*read.notices, Notice("friction", where, what)))
+    elif LEAST_FRICTION < friction < LARGEST_FRICTION:
+        return told
+    else:
+        asked = "are the units of what is observed, of load and stiffness right?"
+        if friction < -LEAST_FRICTION:
+            asked = 'where the slider is sheared backward, direction = "backward" in the run says so'
+        what = f"the friction coefficient is {friction:.3g}: {asked}"
+    return [*told, Notice("friction", where, what)]
 
 
 def _late_steps(run: Run, where: str) -> list[Notice]:

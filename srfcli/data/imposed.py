@@ -609,20 +609,16 @@ def _cost_without(t: Array, x: Array, sigma: Array, knots: Array, k: int) -> flo
     few = np.diff(np.searchsorted(t, knots[k - 1 : k + 2])) < FEWEST_OF_PIECE
     if few.any() and np.any(few & (np.diff(knots[k - 1 : k + 2]) < FEWEST_OF_PIECE * np.median(np.diff(t)))):
         return 0.0
-    slopes = np.diff(_heights(t[near], x[near], sigma[near], kept)) / np.diff(kept)
+    heights, misfit = _heights(t[near], x[near], sigma[near], kept)
+    slopes = np.diff(heights) / np.diff(kept)
     before, after = slopes[k - low - 1], slopes[k - low]
     if abs(after - before) < WOBBLE * max(abs(before), abs(after)):
         return 0.0
-    return _misfit(t[near], x[near], sigma[near], np.delete(kept, k - low)) - _misfit(t[near], x[near], sigma[near], kept)
+    return _heights(t[near], x[near], sigma[near], np.delete(kept, k - low))[1] - misfit
 
 
-def _misfit(t: Array, x: Array, sigma: Array, knots: Array) -> float:
-    heights = _heights(t, x, sigma, knots)
-    return float((((x - np.interp(t, knots, heights)) / sigma) ** 2).sum())
-
-
-def _heights(t: Array, x: Array, sigma: Array, knots: Array) -> Array:
-    """Return the least-squares heights of a continuous line over these knots: a tridiagonal system."""
+def _heights(t: Array, x: Array, sigma: Array, knots: Array) -> tuple[Array, float]:
+    """Return the least-squares heights of a continuous line over these knots, and its misfit: a tridiagonal system."""
     j = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
     share = (t - knots[j]) / np.diff(knots)[j]
     weight = 1 / sigma**2
@@ -641,13 +637,14 @@ def _heights(t: Array, x: Array, sigma: Array, knots: Array) -> Array:
     scale = np.sqrt(np.where(band[1] > 0, band[1], 1.0))  # a piece may lie between two samples, and weights differ by orders
     band[0, 1:] /= scale[1:] * scale[:-1]
     band[1] = 1 + 1e-12
-    return np.asarray(level + solveh_banded(band, right / scale) / scale)
+    heights = np.asarray(level + solveh_banded(band, right / scale) / scale)
+    return heights, float((((x - np.interp(t, knots, heights)) / sigma) ** 2).sum())
 
 
 def _polished(t: Array, x: Array, sigma: Array, knots: Array) -> tuple[Array, Array]:
     """Return the knots moved to their least-squares places, and the heights there: damped Gauss-Newton on both."""
-    heights = _heights(t, x, sigma, knots)
-    misfit, damping, closest = _misfit(t, x, sigma, knots), 1e-3, 0.5 * float(np.diff(t).min())
+    heights, misfit = _heights(t, x, sigma, knots)
+    damping, closest = 1e-3, 0.5 * float(np.diff(t).min())
     for _ in range(CORNER_ROUNDS if knots.size > 2 else 0):
         move = _step(t, x, sigma, knots, heights, damping)
         gaps = np.diff(knots)
@@ -655,10 +652,10 @@ def _polished(t: Array, x: Array, sigma: Array, knots: Array) -> tuple[Array, Ar
         room = np.clip(0.5 * (least - closest), 0.0, 0.4 * least)  # knots stay apart
         trial = knots.copy()
         trial[1:-1] += np.clip(move[1:-1], -room, room)
-        found = _misfit(t, x, sigma, trial)
+        raised, found = _heights(t, x, sigma, trial)
         if found < misfit:
             done = misfit - found < 1e-7 * misfit
-            knots, heights, misfit, damping = trial, _heights(t, x, sigma, trial), found, damping / 4
+            knots, heights, misfit, damping = trial, raised, found, damping / 4
             if done:
                 break
         elif damping > 1e6:
@@ -736,9 +733,7 @@ def load_of(run: RunDescription, columns: Columns, unit: str) -> tuple[Load, lis
 def declared_load(W0: float, modulation: Declared) -> Modulation:
     """Return the load of a declared modulation: frequency (Hz), amplitude, onset (s), and, if given, phase (deg) and rise (s)."""
     f, eps, onset, *more = modulation
-    if not more:
-        return Modulation(W0, eps, f, onset)
-    phase, rise = more
+    phase, rise = more or (0.0, None)
     return Modulation(W0, eps, f, onset, rise, math.radians(phase))
 
 

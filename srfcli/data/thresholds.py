@@ -74,20 +74,16 @@ def read_thresholds(path: Path) -> Thresholds:
     number, header = lines[0]
     delimiter = "\t" if "\t" in header else ";" if ";" in header else ","
     columns = _columns(_split(header, delimiter), f"{path.name} line {number}")
-    rows, given, assumed = [], [], 0
-    for number, line in lines[1:]:
-        row, without = _row(_split(line, delimiter), columns, f"{path.name} line {number}")
-        rows.append(row)
-        given.append(number)
-        assumed += without
+    rows = [_row(_split(line, delimiter), columns, f"{path.name} line {number}") for number, line in lines[1:]]
     if not rows:
         raise SrfError(f"{path} has names but no measurements", "Add a line for each: 10,0.09,11.0,0.33")
-    notes: tuple[str, ...] = ()
-    if assumed:
-        which = "all rows" if assumed == len(rows) else f"{assumed} of {len(rows)} rows"
-        notes = (f"{path.name}: no sigma in {which}; taken as {RELATIVE_ERROR:.0%} of the load, the paper's error",)
     V, eps, W0c, sigma = np.array(rows).T
-    return Thresholds(path.name, V, eps, W0c, sigma, tuple(given), notes)
+    notes: tuple[str, ...] = ()
+    if unknown := int(np.isnan(sigma).sum()):
+        which = "all rows" if unknown == len(rows) else f"{unknown} of {len(rows)} rows"
+        notes = (f"{path.name}: no sigma in {which}; taken as {RELATIVE_ERROR:.0%} of the load, the paper's error",)
+    sigma = np.where(np.isnan(sigma), RELATIVE_ERROR * W0c, sigma)
+    return Thresholds(path.name, V, eps, W0c, sigma, tuple(number for number, _ in lines[1:]), notes)
 
 
 def _split(line: str, delimiter: str) -> list[str]:
@@ -132,30 +128,28 @@ def _factor(name: str, unit: str | None, where: str) -> float:
     return tidy(source.factor / target.factor)
 
 
-def _row(cells: list[str], columns: list[tuple[str, float]], where: str) -> tuple[list[float], bool]:
-    """Return V, eps, W0c, sigma of one line in base units, and whether sigma was assumed."""
+def _row(cells: list[str], columns: list[tuple[str, float]], where: str) -> list[float]:
+    """Return V, eps, W0c, sigma of one line in base units; sigma is NaN where the line does not say it."""
     if len(cells) != len(columns):
         raise SrfError(
             f"{where}: {len(cells)} cells under {len(columns)} names",
             "Give every line one cell for each name; decimals take a point, not a comma.",
         )
-    values: dict[str, float] = {}
+    values = {"sigma": math.nan}
     for (name, factor), cell in zip(columns, cells, strict=True):
-        if name == "sigma" and not cell.strip():
-            continue
-        values[name] = factor * _number(name, cell, where)
+        if name != "sigma" or cell.strip():
+            values[name] = factor * _number(name, cell, where)
     for name in ("V", "W0c"):
         if not values[name] > 0:
             raise SrfError(f"{where}: {name} = {values[name]:g} {UNITS[name]} is not above 0", "Correct or remove it.")
     if not 0 <= values["eps"] < 1:
         raise SrfError(f"{where}: eps = {values['eps']:g} is not in [0, 1)", "eps is relative to W0; in percent head it eps [%].")
-    assumed = "sigma" not in values
-    sigma = RELATIVE_ERROR * values["W0c"] if assumed else values["sigma"]
-    if dict(columns).get("sigma", 1.0) < 0 and not assumed:
+    sigma = values["sigma"]
+    if dict(columns).get("sigma", 1.0) < 0:
         sigma = -sigma * values["W0c"]
-    if not sigma > 0:
+    if sigma <= 0:
         raise SrfError(f"{where}: sigma = {sigma:g} N is not above 0", "Leave the cell empty where it is not known.")
-    return [values["V"], values["eps"], values["W0c"], sigma], assumed
+    return [values["V"], values["eps"], values["W0c"], sigma]
 
 
 def _number(name: str, cell: str, where: str) -> float:

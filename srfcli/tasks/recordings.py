@@ -140,21 +140,17 @@ def new_experiment(
             "the stiffness of the machine is in no table",
             "Say it with `stiffness`: '5.4e-3 1/um' (friction per micron), '55 MPa/mm' (shear stress) or '0.21 N/um' (force).",
         )
+    stated, unit = split_quantity(stiffness, name="`stiffness`", example="5e-3 1/um")
+    if not unit:
+        raise SrfError(
+            f"`stiffness` {stiffness!r} has no unit", "'5e-3 1/um' is friction per micron, '55 MPa/mm' shear stress per length."
+        )
     wish = Wish(
-        stiffness=_stiffness(stiffness), kind=kind, columns=columns or {}, drive=_drive(drive), load=load, mass=mass,
+        stiffness=f"{stated!r} {unit}", kind=kind, columns=columns or {}, drive=_drive(drive), load=load, mass=mass,
         window=_window(window), law=law, ageing=ageing, interface=interface, title=title, reader=reader, holdout=tuple(holdout),
         rig={key: text for key, text in (("radius", radius), ("thickness", thickness), ("area", area)) if text},
     )  # fmt: skip
     return DraftResult(draft(places, Path(folder), wish, registry=registry), Path(folder))
-
-
-def _stiffness(text: str) -> str:
-    number, unit = split_quantity(text, name="`stiffness`", example="5e-3 1/um")
-    if not unit:
-        raise SrfError(
-            f"`stiffness` {text!r} has no unit", "'5e-3 1/um' is friction per micron, '55 MPa/mm' shear stress per length."
-        )
-    return f"{number!r} {unit}"
 
 
 def _drive(given: Any) -> list[tuple[float, float]] | float | None:
