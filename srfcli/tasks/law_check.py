@@ -359,11 +359,9 @@ class _EffectCheck:
             raise Skipped("it is what is fitted or observed that changes")
         if {slot for slot, _ in self.effect.changes} == {"gauge"}:
             return self._shown()
-        own = len(self.plain.states)
-        away = self.rates(self.model, _vector(self.model))[:, :own]
-        at = self.rates(self.model, self.p_neutral)[:, :own]
-        moved = np.max(np.abs(away - at) / np.maximum(np.max(np.abs(at), axis=0), 1e-300))
-        if not np.isfinite(away).all():
+        away, at = (self.rates(self.model, p)[:, : len(self.plain.states)] for p in (_vector(self.model), self.p_neutral))
+        moved = _difference(away, at)
+        if not np.isfinite(moved):
             raise SrfError("the rates are not finite at the default values", "Look at the formula and the defaults.")
         if moved < 1e-12:
             raise SrfError("at the default values the effect changes nothing", "Give the size a default off its neutral value.")

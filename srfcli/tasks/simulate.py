@@ -421,22 +421,9 @@ def runs_again(
 ) -> Work:
     """Return the runs of an experiment, to be simulated with its own laws and values but for those given.
 
-    Parameters
-    ----------
-    laws, parameters : mapping
-        Fields of its ModelChoice, and values as text with or without unit, to take in place of its own.
-    names : sequence of str
-        Of the runs; all if left out.
-    start : str
-        As in `simulate`.
-    noise, lag1, quantum
-        Of the gauges, as in `read_gauges`.
-    seed : int
-        Of the noise and of start values that are off.
-    field : FrictionField, optional
-        Random field that the runs slide on.
-    folder, spread
-        Where the records are written as an experiment, if they are, and by how much its start values are off.
+    `laws` are fields of its ModelChoice, `parameters` values as text; `names` are those of the runs, all if left out. `start` is
+    as in `simulate`, the gauges are as in `read_gauges`; `field` is what the runs slide on. `folder` is where the records are
+    written as an experiment, if they are, and `spread` by how much its start values are off.
     """
     experiment.check_recorded("to simulate")
     choice = replace(experiment.choice, **laws)

@@ -14,7 +14,7 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, as_names, check_choice, worst
 from srfcli.core.settings import check_value, require_parameter
 from srfcli.core.units import to_base
-from srfcli.numerics.hopf import HopfPoint, closed_forms, hopf_points, steady_is_stable, weakening
+from srfcli.numerics.hopf import closed_forms, hopf_points, steady_is_stable, weakening
 from srfcli.numerics.plane import Axis, Plane, check_count
 from srfcli.results.stability import (
     BoundaryResult,
@@ -210,7 +210,15 @@ def _rows(system: SlidingSystem, at: dict[str, float], all_roots: bool) -> list[
         points = [q for q in points if q.leading and q.crossing_rate > 0][:1]
     if not points:
         return [common | {"status": _without_hopf(model, p)}]
-    return [common | _point_cells(q, value) for q in points]
+    rows = []
+    for q in points:
+        cells: dict[str, Any] = {"W0": q.W0, "K_over_W0": value["K"] / q.W0, "Omega_c": q.Omega, "crossing_rate": q.crossing_rate}
+        cells |= {"lyapunov": q.lyapunov, "leading": q.leading, "criticality": q.criticality or None}
+        if "D0" in value:
+            cells["Omega_reduced"] = value["D0"] * q.Omega / value["V"]
+        known = math.isfinite(q.lyapunov)
+        rows.append(common | cells | {"status": "ok" if known else "no Lyapunov coefficient: the Jacobian overflows"})
+    return rows
 
 
 def _without_hopf(model: GeneratedModel, p: Array) -> str:
@@ -224,16 +232,6 @@ def _without_hopf(model: GeneratedModel, p: Array) -> str:
     if all(stable) or not any(stable):
         return f"no Hopf: {'stable' if stable[0] else 'unstable'} at every load looked at"
     return "no Hopf found"
-
-
-def _point_cells(point: HopfPoint, value: dict[str, float]) -> dict[str, Any]:
-    cells: dict[str, Any] = {"W0": point.W0, "K_over_W0": value["K"] / point.W0, "Omega_c": point.Omega}
-    cells["crossing_rate"], cells["lyapunov"], cells["leading"] = point.crossing_rate, point.lyapunov, point.leading
-    known = math.isfinite(point.lyapunov)
-    cells["criticality"] = point.criticality or None
-    if "D0" in value:
-        cells["Omega_reduced"] = value["D0"] * point.Omega / value["V"]
-    return cells | {"status": "ok" if known else "no Lyapunov coefficient: the Jacobian overflows"}
 
 
 # `response`: how sliding follows a modulated load.
