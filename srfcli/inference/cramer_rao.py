@@ -242,15 +242,13 @@ def _errors(question: _Question, told: Sequence[_Told]) -> tuple[dict[str, float
         at = question.names.index(column)
         rest = [i for i, n in enumerate(question.names) if n in question.free and n != column]
         error, alone = _error(F, at, rest, np.array([question.widths[question.names[i]] for i in rest]))
-        unit = _value(question, column) if asked == "lambda" else 1.0
+        unit = 1.0
+        if asked == "lambda":
+            p = run_parameters(question.model, question.experiment, question.experiment.runs[0], question.values)
+            unit = float(p[question.model.index(column)])
         errors[asked] = error / unit if error / unit < UNDETERMINED else math.inf
         peaks[asked] = SIZES[asked] * unit * max((float(np.abs(t.Z @ alone).max(initial=0.0)) for t in told), default=0.0)
     return errors, peaks
-
-
-def _value(question: _Question, name: str) -> float:
-    run = question.experiment.runs[0]
-    return float(run_parameters(question.model, question.experiment, run, question.values)[question.model.index(name)])
 
 
 def _error(F: Array, at: int, rest: list[int], widths: Array) -> tuple[float, Array]:

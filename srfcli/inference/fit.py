@@ -14,7 +14,7 @@ from srfcli.data.groups import GAUGE_NOISE, labels
 from srfcli.data.values import OBSERVABLES, CriticalLoads, Experiment, Run
 from srfcli.inference.critical_loads import Matched, chance_of
 from srfcli.inference.noise import Noise
-from srfcli.inference.prediction import Prediction, own_names, own_start, run_parameters
+from srfcli.inference.prediction import own_names, own_start, run_parameters
 
 
 def inverse(information: Array) -> Array:
@@ -42,7 +42,7 @@ def root(covariance: Array) -> Array:
 
 @dataclass(frozen=True)
 class RunFit:
-    """How one observable of a run is fitted: residual (n,), its noise model, the part of its samples that took part.
+    """How one observable of a run is fitted: expected readings `y` (n,), residual (n,), its noise, the samples that took part.
 
     `colours` are the gauge's coloured noise, of a state-space fit: correlation time (s) and standard deviation of a relaxation,
     frequency (Hz), standard deviation and quality of an oscillation.
@@ -50,7 +50,7 @@ class RunFit:
 
     name: str
     holdout: bool
-    prediction: Prediction
+    y: Array
     residual: Array
     parts: list[tuple[int, int]]
     noise: Noise

@@ -47,17 +47,24 @@ class Dual:
 
 
 @dataclass(frozen=True)
-class Signals:
-    """Which of the signals that are read at the same times each reading (n,) is of, what it shows, and whether in force.
+class Readings:
+    """All readings (n,) of a run, signal by signal at each sample: times (s), which do not fall, values, which are taken up.
 
-    `shows` is GAUGE, SPRING, or the place of a state; of the SPRING, `weighs` (n,) is 1 where its force over the stated stiffness
-    is shown and 0 where its elongation is. `owner` (g,) are the signals that the processes of gauge noise belong to.
+    `number` says of which signal each is, `rate` which row of the gauge noise holds. It shows what `shows` says, GAUGE, SPRING,
+    or the place of a state; of the SPRING, `weighs` is 1 where its force over the stated stiffness is shown, 0 for elongation.
+    A reading is `factor` times that plus `offset` plus gauge noise, of which the white part has the variance `R`.
     """
 
+    t: Array
+    observed: Array
+    used: NDArray[np.bool_]
     number: NDArray[np.intc]
+    rate: NDArray[np.intc]
     shows: NDArray[np.intc]
     weighs: Array
-    owner: tuple[int, ...]
+    factor: Dual
+    offset: Dual
+    R: Dual
 
 
 @dataclass(frozen=True)
@@ -95,39 +102,31 @@ class Innovations:
 def kalman_filter(
     model: GeneratedModel,
     p: Dual,
+    read: Readings,
     *,
     drive: Drive,
     load: Load,
-    t: Array,
-    observed: Array,
-    used: NDArray[np.bool_],
     start: Dual,
     covariance: Dual,
     gauge: Dual,
     order: Sequence[int],
-    rate: NDArray[np.intc],
-    signals: Signals,
-    factor: Dual,
-    offset: Dual,
-    R: Dual,
-    rtol: float = 1e-6,
+    owner: Sequence[int],
+    rtol: float,
     atol: Array,
-    keep: bool = False,
-    most: int | None = None,
-    farthest: float = np.inf,
+    keep: bool,
+    most: int | None,
+    farthest: float,
 ) -> Innovations:
-    """Return the innovations of the readings `observed` (n,) at times `t` (s) that do not fall; those `used` are taken up.
+    """Return the innovations of the readings.
 
-    A reading is `factor` (n,) times the elongation, or what else `signals` say it shows, plus `offset` (n,) plus gauge noise:
-    white of variance `R` (n,), and processes of as many states as `order` (g,) says, 3 a signal at most. `gauge` (rates, g, 3)
-    has their parameters: of one state, e' = -e/tau + s sqrt(2/tau) w, (tau, s, -); of two, an oscillator of frequency f (Hz),
-    quality q and standard deviation s, (f, s, q). `rate` (n,) says which row holds at a sample; where it changes, a new noise
-    begins.
+    Beside white noise a gauge has processes of as many states as `order` (g,) says, of the signals `owner` (g,), 3 each at most.
+    `gauge` (rates, g, 3) has their parameters: of one state, e' = -e/tau + s sqrt(2/tau) w, (tau, s, -); of two, an oscillator of
+    frequency f (Hz), quality q and standard deviation s, (f, s, q). Where a reading has another row, a new noise begins.
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
     numbers in the same k directions. A reading moves ln v and ln PHI by no more than `farthest`, and the field by as many of its
     standard deviations, as what it says of them is linear: beside the fall of a stick-slip cycle that may be a velocity of any
     size, which cannot be followed. Each reading is still predicted from those before it alone, so that the likelihood is one.
-    After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a compiler, or for a model without a
+    After `most` steps, 50 a sample if that is None, the rest is NaN. Raises SrfError without a compiler, or for a model without a
     random friction field.
     """
     if "field_gain" not in model.namespace:
@@ -135,18 +134,18 @@ def kalman_filter(
     library = compiled(model, "filter")
     if library is None:
         raise SrfError("the Kalman filter needs a C compiler", "Install one, or the package ziglang.")
-    n, k, states = t.size, p.d.shape[-1], len(model.states)
-    if len(order) > GAUGE_PROCESSES * SIGNALS or signals.number.max() >= SIGNALS:
+    n, k, states = read.t.size, p.d.shape[-1], len(model.states)
+    if len(order) > GAUGE_PROCESSES * SIGNALS or read.number.max() >= SIGNALS:
         raise SrfError(f"more than {GAUGE_PROCESSES} processes of gauge noise a signal, or more than {SIGNALS} signals")
-    wide, own, owner = states + sum(order), integers(np.array([*order, 0])), integers(np.array([*signals.owner, 0]))
+    wide, orders, owners = states + sum(order), integers(np.array([*order, 0])), integers(np.array([*owner, 0]))
     weighed = model.index("weighed") if "weighed" in model.names else -1
-    rates, number, shows = integers(rate), integers(signals.number), integers(signals.shows)
+    rates, number, shows = integers(read.rate), integers(read.number), integers(read.shows)
     nu, S = np.full(n, np.nan), np.full(n, np.nan)
     nu_d, S_d = np.full((n, k), np.nan), np.full((n, k), np.nan)
     shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide), (n, wide)) if keep else ((1,),) * 5
     arrays = [np.full(shape, np.nan) for shape in shapes]
     stats, stop, reached = np.zeros(3), ctypes.c_int(0), n
-    imposed, use = imposed_arguments(t, drive, load), np.ascontiguousarray(used, dtype=np.uint8)
+    imposed, use = imposed_arguments(read.t, drive, load), np.ascontiguousarray(read.used, dtype=np.uint8)
     size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000) if most is None else most
     allowed, bounds = np.asarray(atol) * size / rtol, _bounds(model, p, farthest)
     for first in range(0, max(k, 1), LANES):
@@ -154,13 +153,11 @@ def kalman_filter(
         keeping = keep and first == 0
         arguments = (
             *imposed, doubles(p.packed(first)), doubles(start.packed(first)), doubles(covariance.packed(first)),
-            len(order), own, owner, doubles(gauge.packed(first)), rates, number, shows, doubles(signals.weighs),
-            weighed,
-            int(k > 0), ctypes.c_double(size), doubles(allowed),
-            ctypes.c_long(most), n,
-            doubles(t), doubles(observed), ctypes.c_void_p(use.ctypes.data), doubles(factor.packed(first)),
-            doubles(offset.packed(first)), doubles(R.packed(first)), doubles(bounds.packed(first)), int(keeping), doubles(nu),
-            doubles(S), doubles(own_nu), doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),
+            len(order), orders, owners, doubles(gauge.packed(first)), rates, number, shows, doubles(read.weighs), weighed,
+            int(k > 0), ctypes.c_double(size), doubles(allowed), ctypes.c_long(most), n, doubles(read.t), doubles(read.observed),
+            ctypes.c_void_p(use.ctypes.data), doubles(read.factor.packed(first)), doubles(read.offset.packed(first)),
+            doubles(read.R.packed(first)), doubles(bounds.packed(first)), int(keeping), doubles(nu), doubles(S),
+            doubles(own_nu), doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),
         )  # fmt: skip
         reached = min(reached, interruptible(lambda arguments=arguments: library.srf_filter(*arguments), stop))  # type: ignore[misc]
         count = min(LANES, k - first)
@@ -181,16 +178,10 @@ def _bounds(model: GeneratedModel, p: Dual, farthest: float) -> Dual:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Mean (n, a) and covariance (n, a, a) of states and gauge noise at each reading, given all readings of the run.
-
-    `r` (n, a) and `N` (n, a, a) are the smoother's own: the score of the log likelihood by a shift of the state just after the
-    sample before, and its variance.
-    """
+    """Mean (n, a) and covariance (n, a, a) of states and gauge noise at each reading, given all readings of the run."""
 
     mean: Array
     covariance: Array
-    r: Array
-    N: Array
 
 
 def smooth(found: Innovations, used: NDArray[np.bool_]) -> Smoothed:
@@ -199,17 +190,15 @@ def smooth(found: Innovations, used: NDArray[np.bool_]) -> Smoothed:
     if kept is None:
         raise SrfError("the filter kept nothing to smooth", "kalman_filter(..., keep=True)")
     n, a = kept.mean.shape
-    r, N = np.zeros(a), np.zeros((a, a))
+    r, N = np.zeros(a), np.zeros((a, a))  # the score of the log likelihood by a shift of the state here, and its variance
     mean, P = kept.mean.copy(), kept.covariance.copy()
-    scores, information = np.zeros((n, a)), np.zeros((n, a, a))
     for k in range(n - 1, -1, -1):
         if used[k] and k < found.reached:
             H, S = kept.gradient[k], found.S[k]
             through = np.eye(a) - np.outer(kept.gain[k], H)
             r = H * (found.nu[k] / S) + through.T @ r
             N = np.outer(H, H) / S + through.T @ N @ through
-        scores[k], information[k] = r, N
         mean[k] += kept.covariance[k] @ r
         P[k] -= kept.covariance[k] @ N @ kept.covariance[k]
         r, N = kept.transition[k].T @ r, kept.transition[k].T @ N @ kept.transition[k]
-    return Smoothed(mean, P, scores, information)
+    return Smoothed(mean, P)

@@ -213,7 +213,9 @@ def draw(
             if not burnt and number % every == 0:
                 later = sampler.get_chain(discard=number // 3)
                 ridge.learn(later.reshape(-1, k))
-                mixed = number >= LEFT_OUT * _slowness(later) and r_hat(later).max() <= BURNT_IN
+                independent = np.nanmin(np.maximum(effective_size(later), 1e-9))  # draws of the slowest parameter
+                slowness = later.shape[0] * chains / independent  # steps after which they are
+                mixed = number >= LEFT_OUT * slowness and r_hat(later).max() <= BURNT_IN
                 burnt = number if mixed or number >= LONGEST_BURN_IN else 0
             progress(f"posterior: step {number}", number / (max(burnt, every) + steps))
             if burnt and number == burnt + steps:
@@ -225,12 +227,6 @@ def draw(
         burnt = burnt or sampler.iteration // 2
     accepted = float(np.mean(sampler.acceptance_fraction))
     return Posterior(names, scale.back(sampler.get_chain(discard=burnt)), burnt, accepted, interrupted)
-
-
-def _slowness(chains: Array) -> float:
-    """Return after how many steps the slowest parameter's draws are independent."""
-    steps, count, _ = chains.shape
-    return float(steps * count / np.nanmin(np.maximum(effective_size(chains), 1e-9)))
 
 
 def _within(theta: Array, bounds: tuple[Array, Array]) -> Array:

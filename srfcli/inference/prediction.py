@@ -264,23 +264,20 @@ def predict(
     values: Mapping[str, float],
     *,
     by: Sequence[str] = (),
-    until: float = np.inf,
     rtol: float = MOTION_RTOL,
     trend: str | None = None,
     tables: Sequence[Spline] = (),
     by_tables: Sequence[int] = (),
 ) -> Prediction:
-    """Return the observable of `run` at its sample times up to `until` s, with derivatives by the parameters `by`.
+    """Return the observable of `run` at its sample times, with derivatives by the parameters `by`.
 
     Of a model with tables, J goes on with a column for each number of the tables in `by_tables`.
-
     It starts in steady sliding, or where `values` say (see `own_names`). A trend is added to the observable: values["RUN.trend"]
     times displacement or time. Values are in um, s, N.
     """
     p = run_parameters(model, experiment, run, values)
     if tables:
         p = appended(p, tables)
-    t = run.t[: max(int(np.sum(run.t <= until)), 2)]
     still = experiment.elsewhere(run)
     own = [k for k, n in enumerate(by) if n not in still and (n in model.names or n.startswith(f"{run.name}."))]
     moving = [k for k in own if not by[k].endswith(".trend")]
@@ -291,26 +288,24 @@ def predict(
     x0, S0 = start_state(model, run, p, values, names, numbers)
     size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
     motion = integrate(
-        model, p[: len(model.names)], drive=run.drive, load=run.load, t=t, start=x0, by=places, S0=S0, tables=tables,
+        model, p[: len(model.names)], drive=run.drive, load=run.load, t=run.t, start=x0, by=places, S0=S0, tables=tables,
         by_tables=by_tables, rtol=rtol, atol=rtol * size,
     )  # fmt: skip
-    y, slopes = _observe(model, run, t, motion.x, motion.S, p, [*places, *numbers])
-    J = np.zeros((t.size, len(by) + len(numbers)))
+    y, slopes = _observe(model, run, motion.x, motion.S, p, [*places, *numbers])
+    J = np.zeros((run.t.size, len(by) + len(numbers)))
     J[:, [*moving, *range(len(by), J.shape[1])]] = slopes * share
     if trend:
-        y = y + values[f"{run.name}.trend"] * basis(run, trend)[: t.size]
-        J[:, [k for k in own if k not in moving]] = basis(run, trend)[: t.size, None]
+        y = y + values[f"{run.name}.trend"] * basis(run, trend)
+        J[:, [k for k in own if k not in moving]] = basis(run, trend)[:, None]
     return Prediction(y, J, motion.x, motion.status, motion.reached)
 
 
-def _observe(
-    model: GeneratedModel, run: Run, t: Array, x: Array, S: Array, p: Array, places: Sequence[int]
-) -> tuple[Array, Array]:
+def _observe(model: GeneratedModel, run: Run, x: Array, S: Array, p: Array, places: Sequence[int]) -> tuple[Array, Array]:
     """Return the recorded quantity and its derivatives: elongation u, spring force K u, or friction K u/W."""
-    V, (W, W_dot) = run.drive(t), run.load(t)
+    V, (W, W_dot) = run.drive(run.t), run.load(run.t)
     K = p[model.index("K")]
     factor = np.broadcast_to(per_elongation(run.observable, K, W), W.shape)
-    J = np.zeros((t.size, len(places)))
+    J = np.zeros((run.t.size, len(places)))
     recorded = model.namespace.get("OBSERVED", "u")
     if recorded in model.states:
         i = model.states.index(recorded)

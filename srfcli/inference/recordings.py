@@ -245,12 +245,10 @@ def field_correlation(found: StateSpaceFit) -> float:
 
 def slip_along(run: Run, x: Array, states: tuple[str, ...]) -> Array:
     """Return the slip (n,) in um along smoothed states, from the run's start on."""
-    if "u" in states:  # exact, where stick-slip is faster than the samples
-        return slip_from(run, x[:, states.index("u")])
+    if (
+        "u" in states
+    ):  # exact, where stick-slip is faster than the samples: what the stage moved less what the spring was stretched
+        u = x[:, states.index("u")]
+        return np.asarray(run.start + (run.drive.displacement(run.t) - (u - u[0])))
     v = np.exp(x[:, states.index("ln_v")])
     return run.start + np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(run.t))])
-
-
-def slip_from(run: Run, u: Array) -> Array:
-    """Return the slip (n,) in um from the run's start on: what the stage moved less what the spring was stretched, u (n,)."""
-    return np.asarray(run.start + (run.drive.displacement(run.t) - (u - u[0])))

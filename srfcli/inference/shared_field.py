@@ -93,12 +93,9 @@ def _track(runs: Sequence[Run]) -> Spline:
 
 def _judged(likelihood: SharedLikelihood, point: Point, name: str) -> RunFit:
     run = next(r for r in likelihood.problem.experiment.runs if r.name == name)
-    prediction = likelihood.predicted(run, point.theta, point.track, slopes=False)
-    residual = run.observed - prediction.y
-    parts = stretches(run.t, run.used)
-    return RunFit(
-        name, run.holdout, prediction, residual, parts, estimate_noise(residual, parts), difference_level(residual, parts)
-    )
+    y = likelihood.predicted(run, point.theta, point.track, slopes=False).y
+    residual, parts = run.observed - y, stretches(run.t, run.used)
+    return RunFit(name, run.holdout, y, residual, parts, estimate_noise(residual, parts), difference_level(residual, parts))
 
 
 @dataclass(frozen=True)

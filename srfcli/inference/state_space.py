@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from typing import Any, TypeAlias, TypeVar
@@ -32,10 +32,9 @@ from srfcli.data.noise import calm_level, carried
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import Fit, Problem, RunFit, inverse
-from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
+from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Readings, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
-    Prediction,
     basis,
     derivative,
     first_elongation,
@@ -118,7 +117,7 @@ class Filtered:
     def of(self, signal: int) -> Innovations:
         """Return innovations (n,), variances and derivatives of one signal, and what was kept where its readings are."""
         f, k, c = self.every, len(self.run.signals), slice(signal, None, len(self.run.signals))
-        kept = f.kept and Kept(*(getattr(f.kept, own.name)[c] for own in fields(f.kept)))
+        kept = f.kept and Kept(*(x[c] for x in vars(f.kept).values()))
         return Innovations(f.nu[c], f.S[c], f.nu_d[c], f.S_d[c], (f.reached + k - 1 - signal) // k, f.steps, f.bounded, kept)
 
     @cached_property
@@ -131,11 +130,6 @@ class Filtered:
         """Return the places of the readings used (m,) among all, those of the first signal first."""
         k = len(self.run.signals)
         return np.concatenate([np.nonzero(s.used)[0] * k + i for i, s in enumerate(self.run.signals)])
-
-    @cached_property
-    def taken(self) -> Array:
-        """Return whether each of all readings is used."""
-        return np.stack([s.used for s in self.run.signals], axis=1).ravel()
 
     @property
     def whole(self) -> bool:
@@ -189,29 +183,15 @@ class Filtered:
 
     def smoothed(self) -> Smoothed:
         """Return states and field (n, ...) given all readings of the run; it was filtered with `keep`."""
-        found, k = smooth(self.every, self.taken), len(self.run.signals)
-        return Smoothed(found.mean[::k], found.covariance[::k], found.r[::k], found.N[::k])
+        k, taken = len(self.run.signals), np.stack([s.used for s in self.run.signals], axis=1).ravel()
+        found = smooth(self.every, taken)
+        return Smoothed(found.mean[::k], found.covariance[::k])
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """All readings of a run, signal by signal at each sample: times, values, which are used, what they show of the model.
-
-    A reading is `factor` times that plus `offset`; `variance` (signals,) is what rounding adds.
-    """
-
-    t: Array
-    observed: Array
-    used: Array
-    signals: Signals
-    factor: Dual
-    offset: Dual
-    rounding: Array
-
-
-def _rows(
-    model: GeneratedModel, run: Run, K: Dual, values: Mapping[str, float], by: Sequence[str], processes: int, trend: str | None
-) -> _Rows:
+def _readings(
+    model: GeneratedModel, run: Run, K: Dual, white: Dual, values: Mapping[str, float], by: Sequence[str], trend: str | None
+) -> Readings:
+    """Return all readings of a run; `white` (signals * rates,) are the standard deviations of the white noise."""
     n, k, c = run.t.size, len(by), len(run.signals)
     W = run.load(run.t)[0]
     factors, offsets, shows, weighs = [], [], [], []
@@ -244,13 +224,14 @@ def _rows(
     def woven(duals: Sequence[Dual]) -> Dual:
         return Dual(np.stack([a.v for a in duals], axis=1).ravel(), np.stack([a.d for a in duals], axis=1).reshape(n * c, k))
 
-    signals = Signals(
-        np.tile(np.arange(c, dtype=np.intc), n), np.tile(np.array(shows, dtype=np.intc), n), np.tile(weighs, n),
-        tuple(i for i in range(c) for _ in range(processes)),
-    )  # fmt: skip
     observed, used = (np.stack([getattr(s, name) for s in run.signals], axis=1).ravel() for name in ("observed", "used"))
-    rounding = np.array([s.quantum**2 / 12 for s in run.signals])
-    return _Rows(np.repeat(run.t, c), observed, used, signals, woven(factors), woven(offsets), rounding)
+    numbers, rate = np.tile(np.arange(c, dtype=np.intc), n), np.repeat(run.sampling.at, c)
+    rounding, level = np.array([s.quantum**2 / 12 for s in run.signals]), numbers * len(run.sampling.spacings) + rate
+    R = Dual((white.v**2)[level] + rounding[numbers], (2 * white.v[:, None] * white.d)[level])
+    return Readings(
+        np.repeat(run.t, c), observed, used, numbers, rate, np.tile(np.array(shows, dtype=np.intc), n), np.tile(weighs, n),
+        woven(factors), woven(offsets), R,
+    )  # fmt: skip
 
 
 def filter_run(
@@ -287,20 +268,16 @@ def filter_run(
     gauges = gauges or [{n: n for n in values if n.startswith("gauge_")}] * (rates * c)
     rows = gauge_rows(processes_in(gauges[0]))
     K = Dual(p[[model.index("K")]], d[[model.index("K")]])
-    read = _rows(model, run, K, values, by, len(rows), trend)
-    rate, which = np.repeat(run.sampling.at, c), read.signals.number
-    white = _dual([own["gauge_white"] for own in gauges], values, by)
-    at = which * rates + rate
-    R = Dual((white.v**2)[at] + read.rounding[which], (2 * white.v[:, None] * white.d)[at])
+    read = _readings(model, run, K, _dual([own["gauge_white"] for own in gauges], values, by), values, by, trend)
     colour = _dual([own[n] if n else "" for own in gauges for row in rows for n in (*row, "")[:3]], values, by)
     gauge = [a.reshape(c, rates, len(rows), 3, *a.shape[1:]).swapaxes(0, 1) for a in (colour.v, colour.d)]
     size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
     fine = np.array([max(values["field_amplitude"], 1e-3) if s.startswith("field") else 1.0 for s in model.states])
     found = kalman_filter(
-        model, Dual(p, d), drive=run.drive, load=run.load, t=read.t, observed=read.observed, used=read.used, start=start,
-        covariance=P0, gauge=Dual(gauge[0].reshape(rates, -1, 3), gauge[1].reshape(rates, c * len(rows), 3, k)),
-        order=[len(row) - 1 for row in rows] * c, rate=rate, signals=read.signals, factor=read.factor, offset=read.offset,
-        R=R, rtol=rtol, atol=rtol * size * fine, keep=keep, most=most, farthest=farthest,
+        model, Dual(p, d), read, drive=run.drive, load=run.load, start=start, covariance=P0,
+        gauge=Dual(gauge[0].reshape(rates, -1, 3), gauge[1].reshape(rates, c * len(rows), 3, k)),
+        order=[len(row) - 1 for row in rows] * c, owner=np.repeat(np.arange(c), len(rows)).tolist(),
+        rtol=rtol, atol=rtol * size * fine, keep=keep, most=most, farthest=farthest,
     )  # fmt: skip
     return Filtered(run, tuple(by), found)
 
@@ -453,19 +430,10 @@ class Likelihood:
         """Return the number of readings used, and of critical loads."""
         return sum(int(run.used.sum()) for run in self.problem.runs) + sum(len(t.table) for t in self.problem.tables)
 
-    @property
-    def _varying(self) -> dict[str, list[str]]:
-        """Return the names of what varies between runs, by the parameter that it is."""
-        found: dict[str, list[str]] = {}
-        for n, name in (item for own in self.problem.varying.values() for item in own.items()):
-            if name in self.names and name not in found.setdefault(n, []):
-                found[n].append(name)
-        return found
-
     def _table(self, loads: CriticalLoads) -> TableLikelihood:
-        problem, varying = self.problem, self._varying
+        problem = self.problem
         assert problem.stability is not None
-        place = {name: n for n, names in varying.items() for name in names}
+        place = {name: n for n, names in problem.groups.items() for name in names}
         rows = zip(problem.names, problem.start, problem.lower, problem.upper, strict=True)
         bounds = {place.get(name, name): (float(a), float(b), float(c)) for name, a, b, c in rows}
         return TableLikelihood(problem.stability, loads, apparatus(problem.experiment, loads.frequency), bounds)
@@ -476,7 +444,7 @@ class Likelihood:
 
     def _matched(self, table: TableLikelihood, values: Mapping[str, float], **how: bool) -> Matched:
         found = table.at(values, **how)
-        return replace(found, names=self.names, slopes=joined_slopes(found, self.names, self._varying))
+        return replace(found, names=self.names, slopes=joined_slopes(found, self.names, self.problem.groups))
 
     def values(self, x: Array) -> dict[str, float]:
         """Return parameters by name in um, s, N."""
@@ -1140,31 +1108,25 @@ def fit_state_space(
     of a model that lacks something are not. `beside` says whether maxima next to that found are looked for
     (`likeliest_beside`). What stays below `least` in log likelihood is not finished. The status is that of the last maximisation.
     """
-    tried: list[Likelihood] = []
-
-    def likelihood(smooth: bool, processes: Sequence[str]) -> Likelihood:
-        tried.append(Likelihood(problem, smooth=smooth, processes=processes, rtol=rtol))
-        return tried[-1]
-
-    choice: dict[str, Any] = {
-        "smooth": smooth, "processes": processes, "cautious": cautious, "close": close, "progress": progress,
-    }  # fmt: skip
+    fit = _FitUnderWay(problem, smooth, processes, cautious, close, rtol, progress)
     try:
         if part is None and start is None and (runs := thinned(problem.runs, many)) is not problem.runs:
-            rest = replace(problem, runs=runs)
-            part = fit_state_space(rest, thorough=thorough, beside=beside, rtol=rtol, many=many, **choice)
+            part = fit_state_space(
+                replace(problem, runs=runs), smooth=smooth, processes=processes, cautious=cautious, thorough=thorough,
+                beside=beside, close=close, rtol=rtol, many=many, progress=progress,
+            )  # fmt: skip
         if not problem.runs:  # there is neither field nor gauge
-            own = likelihood(True, ())
-            found = StateSpaceFit(own, maximise(own, own.coordinates(start or {}), close=close, progress=progress))
+            own = fit.likelihood(True, ())
+            found = fit.maximised(own, own.coordinates(start or {}))
         elif part is not None and part.maximum.status is not Status.INTEGRATION:
-            found = _on_all(part, likelihood, **choice)
+            found = fit.on_all(part)
         else:
-            found = _fitted(likelihood, start or {}, thorough=thorough, beside=beside, least=least, **choice)
+            found = fit.from_start(start or {}, thorough=thorough, beside=beside, least=least)
         found = _surveyed(found, close, progress) if problem.tables else found
-        return replace(found, evaluations=sum(own.evaluations for own in tried) + (part.evaluations if part else 0))
+        return replace(found, evaluations=sum(own.evaluations for own in fit.tried) + (part.evaluations if part else 0))
     except KeyboardInterrupt as error:
         likely = []
-        for own in tried:
+        for own in fit.tried:
             if (last := own.best) is not None:
                 unknown = np.full_like(last.information, np.nan)
                 likely.append(StateSpaceFit(own, Maximum(last, np.inf, Status.INTERRUPTED, unknown)))
@@ -1218,98 +1180,178 @@ def _carried(found: StateSpaceFit, likelihood: Likelihood) -> dict[str, float]:
     return values
 
 
-def _on_all(
-    part: StateSpaceFit,
-    likelihood: Callable[[bool, Sequence[str]], Likelihood],
-    smooth: bool | None,
-    processes: Sequence[str] | None,
-    cautious: bool,
-    close: float,
-    progress: Callable[[str], None],
-) -> StateSpaceFit:
-    """Return the fit to all readings from that to a part of them; a small field and further colours may show in all alone."""
-    whole = likelihood(part.smooth, part.likelihood.processes)
-    x = whole.coordinates(_carried(part, whole))
-    best = StateSpaceFit(whole, maximise(whole, x, close=close, progress=progress))
-    if processes is None:
-        best = _with_colour(best, likelihood, progress, cautious)
-    if smooth is None and best.smooth:
-        best = _beside_small_field(best, likelihood)
-    settled = best.likelihood is whole and best.maximum.away < close
-    return best if settled else _with_or_without(best, smooth, likelihood, close, progress)
+@dataclass(frozen=True)
+class _FitUnderWay:
+    """The steps of `fit_state_space`, whose arguments hold for all of them; `tried` are the likelihoods so far."""
 
+    problem: Problem
+    smooth: bool | None
+    processes: Sequence[str] | None
+    cautious: bool
+    close: float
+    rtol: float
+    progress: Callable[[str], None]
+    tried: list[Likelihood] = field(default_factory=list)
 
-def _fitted(
-    likelihood: Callable[[bool, Sequence[str]], Likelihood],
-    start: Mapping[str, float],
-    *,
-    smooth: bool | None,
-    processes: Sequence[str] | None,
-    cautious: bool,
-    thorough: bool,
-    beside: bool,
-    least: float,
-    close: float,
-    progress: Callable[[str], None],
-) -> StateSpaceFit:
-    wide = likelihood(False, processes or ())
-    fresh = "field_amplitude" not in start
+    def likelihood(self, smooth: bool, processes: Sequence[str]) -> Likelihood:
+        """Return the likelihood without a field if `smooth`, with this coloured gauge noise."""
+        self.tried.append(Likelihood(self.problem, smooth=smooth, processes=processes, rtol=self.rtol))
+        return self.tried[-1]
 
-    steps = SCORING_STEPS // 2 if fresh else 12
-    found = from_any(wide, wide_starts(wide, start, progress), steps, progress)
-    if found is None or (fresh and found.status is Status.INTEGRATION):
-        found = from_any(wide, multi_start(wide, wide.coordinates(start), progress)[: len(WIDE)], steps, progress)
-    assert found is not None
-    if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
-        found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
-    if fresh and found.status is not Status.INTEGRATION:
-        found = scan_narrow(wide, found.point, progress) or found
-    best = StateSpaceFit(wide, found)
-    if found.status is Status.INTEGRATION:
-        return best
-    if found.expected < least:
-        found = maximise(wide, found.point.x, close=close, progress=progress) if np.isinf(found.away) else found
+    def maximised(self, likelihood: Likelihood, x: Array, *, steps: int = SCORING_STEPS) -> StateSpaceFit:
+        """Return the fit at the maximum from x."""
+        return StateSpaceFit(likelihood, maximise(likelihood, x, steps=steps, close=self.close, progress=self.progress))
+
+    def on_all(self, part: StateSpaceFit) -> StateSpaceFit:
+        """Return the fit to all readings from that to a part of them; a small field and further colours may show in all alone."""
+        whole = self.likelihood(part.smooth, part.likelihood.processes)
+        best = self.maximised(whole, whole.coordinates(_carried(part, whole)))
+        if self.processes is None:
+            best = self.with_colour(best)
+        if self.smooth is None and best.smooth:
+            best = self.beside_small_field(best)
+        settled = best.likelihood is whole and best.maximum.away < self.close
+        return best if settled else self.with_or_without(best)
+
+    def from_start(self, start: Mapping[str, float], *, thorough: bool, beside: bool, least: float) -> StateSpaceFit:
+        """Return the fit from values by name; see `fit_state_space`."""
+        smooth, processes, close, progress = self.smooth, self.processes, self.close, self.progress
+        wide, fresh = self.likelihood(False, processes or ()), "field_amplitude" not in start
+        steps = SCORING_STEPS // 2 if fresh else 12
+        found = from_any(wide, wide_starts(wide, start, progress), steps, progress)
+        if found is None or (fresh and found.status is Status.INTEGRATION):
+            found = from_any(wide, multi_start(wide, wide.coordinates(start), progress)[: len(WIDE)], steps, progress)
+        assert found is not None
+        if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
+            found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
+        if fresh and found.status is not Status.INTEGRATION:
+            found = scan_narrow(wide, found.point, progress) or found
         best = StateSpaceFit(wide, found)
-        if found.expected < least and processes is not None:
+        if found.status is Status.INTEGRATION:
             return best
-    # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
-    best = first = _with_colour(best, likelihood, progress, cautious, least) if processes is None else best
-    if best.maximum.expected < least:
+        if found.expected < least:
+            found = maximise(wide, found.point.x, close=close, progress=progress) if np.isinf(found.away) else found
+            best = StateSpaceFit(wide, found)
+            if found.expected < least and processes is not None:
+                return best
+        # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
+        best = first = self.with_colour(best, least) if processes is None else best
+        if best.maximum.expected < least:
+            return best
+        best = self.with_or_without(best)
+        if thorough and processes is None:
+            moved = best.smooth or best.log_likelihood > first.log_likelihood + NEEDED
+            wider = self.with_colour(best) if moved else best
+            grown = len(wider.likelihood.processes) > len(best.likelihood.processes)
+            best = self.with_or_without(wider) if grown else wider
+            known = best.likelihood.processes
+            wanted = not grown and smooth is None and not best.smooth
+            if wanted and (not known or (_short_field(best) and len(known) < GAUGE_PROCESSES)):
+                instead = self.likelihood(True, (*known, "relaxation"))
+                other = _coloured(best, instead, progress)  # colour in place of the field?
+                if fresh and _short_field(best):  # which may have led the other parameters astray
+                    k = len(instead.problem.names)
+                    x = np.concatenate([instead.coordinates(start)[:k], other.maximum.point.x[k:]])
+                    anew = maximise(instead, x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
+                    other = max(other, StateSpaceFit(instead, anew), key=lambda f: f.log_likelihood)
+                if other.criterion > best.criterion - CLOSE_CALL:
+                    other = self.maximised(instead, other.maximum.point.x)
+                if other.criterion > best.criterion:  # beside the colour there may be another, smaller field
+                    best = self.beside_small_field(other)
+                    best = best if best.smooth else self.with_or_without(best)
+        widest = wide.values(wide.start)["field_amplitude"]  # which may stand for colour, and for falls that come as a surprise
+        if fresh and processes is None and best.maximum.point.surprising and best.values["field_amplitude"] > widest:
+            coloured = self.likelihood(False, best.likelihood.processes or ("relaxation",))
+            another = from_any(coloured, wide_starts(coloured, start, progress), steps, progress)
+            if another and another.expected > best.log_likelihood:
+                other = self.maximised(coloured, another.point.x)
+                best = max(best, self.with_or_without(other), key=lambda f: f.criterion)
+        if fresh:
+            best = likeliest_beside(best, close, progress) if beside else best
+        if fresh and smooth is None and best.smooth:
+            best = _with_faint_fields(best, self.likelihood(False, best.likelihood.processes))
         return best
-    best = _with_or_without(best, smooth, likelihood, close, progress)
-    if thorough and processes is None:
-        moved = best.smooth or best.log_likelihood > first.log_likelihood + NEEDED
-        wider = _with_colour(best, likelihood, progress, cautious) if moved else best
-        grown = len(wider.likelihood.processes) > len(best.likelihood.processes)
-        best = _with_or_without(wider, smooth, likelihood, close, progress) if grown else wider
-        known = best.likelihood.processes
-        wanted = not grown and smooth is None and not best.smooth
-        if wanted and (not known or (_short_field(best) and len(known) < GAUGE_PROCESSES)):
-            instead = likelihood(True, (*known, "relaxation"))
-            other = _coloured(best, instead, progress)  # colour in place of the field?
-            if fresh and _short_field(best):  # which may have led the other parameters astray
-                k = len(instead.problem.names)
-                x = np.concatenate([instead.coordinates(start)[:k], other.maximum.point.x[k:]])
-                anew = maximise(instead, x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
-                other = max(other, StateSpaceFit(instead, anew), key=lambda f: f.log_likelihood)
-            if other.criterion > best.criterion - CLOSE_CALL:
-                own = maximise(instead, other.maximum.point.x, close=close, progress=progress)
-                other = StateSpaceFit(instead, own)
-            if other.criterion > best.criterion:  # beside the colour there may be another, smaller field
-                best = _beside_small_field(other, likelihood)
-                best = best if best.smooth else _with_or_without(best, smooth, likelihood, close, progress)
-    widest = wide.values(wide.start)["field_amplitude"]  # which may stand for colour, and for falls that come as a surprise
-    if fresh and processes is None and best.maximum.point.surprising and best.values["field_amplitude"] > widest:
-        coloured = likelihood(False, best.likelihood.processes or ("relaxation",))
-        another = from_any(coloured, wide_starts(coloured, start, progress), steps, progress)
-        if another and another.expected > best.log_likelihood:
-            other = StateSpaceFit(coloured, maximise(coloured, another.point.x, close=close, progress=progress))
-            best = max(best, _with_or_without(other, smooth, likelihood, close, progress), key=lambda f: f.criterion)
-    if fresh:
-        best = likeliest_beside(best, close, progress) if beside else best
-    if fresh and smooth is None and best.smooth:
-        best = _with_faint_fields(best, likelihood(False, best.likelihood.processes))
-    return best
+
+    def with_colour(self, best: StateSpaceFit, least: float = -np.inf) -> StateSpaceFit:
+        """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants; if `cautious`, see there.
+
+        One whose correlation falls off exponentially is tried first, an oscillation where that leaves most stretches correlated:
+        what the physics lack leaves a few. No more are tried where as many as there may be, each with the gain of the last, would
+        leave the log likelihood below `least`.
+        """
+        while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > DEVIATION:
+            if self.cautious and known and not steadily_coloured(best, self.cautious):
+                break
+            found = best
+            for kind in PROCESSES:
+                wider = _coloured(best, self.likelihood(best.smooth, (*known, kind)), self.progress)
+                found = max(found, wider, key=lambda f: f.criterion)
+                if not steadily_coloured(wider, self.cautious):
+                    break
+            if found is best:
+                break
+            last, best = found.maximum.expected - best.maximum.expected, found
+            if found.maximum.expected + max(last, 0.0) * (GAUGE_PROCESSES - len(found.likelihood.processes)) < least:
+                break
+        return best
+
+    def with_or_without(self, begun: StateSpaceFit) -> StateSpaceFit:
+        """Return the fit from where one begun stands, with a field or without, as `smooth` says or the likelihood."""
+        rough, smooth, close, progress = begun.likelihood, self.smooth, self.close, self.progress
+        if rough.smooth:
+            return self.maximised(rough, begun.maximum.point.x)
+        plain = self.likelihood(True, rough.processes)
+        at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
+        faint = _amplitude(rough, FAINT_FIELD)
+
+        def without_field(steps: int) -> StateSpaceFit:
+            progress("without a field")
+            return self.maximised(plain, plain.coordinates(found.point.values), steps=steps)
+
+        tried: StateSpaceFit | None = None
+        if not np.isfinite(found.away):
+            found = maximise(rough, found.point.x, close=close, progress=progress)
+        elsewhere = False  # a field finer than the samples, or one that is slow, may be a maximum of its own
+        while rough.evaluations - before < SCORING_STEPS:
+            last = found.point.x
+            found = maximise(rough, last, steps=3, close=close, widths=(), progress=progress)
+            if found.away < close or np.array_equal(found.point.x, last):
+                other = None if elsewhere else _small_field(rough, found.point)
+                if other is None:
+                    break
+                elsewhere, found = True, replace(found, point=other)
+                continue
+            if found.point.x[at] < last[at] - FIELD_SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
+                found = replace(found, point=_shrunk(rough, found.point, at))
+            if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
+                tried = without_field(TRIAL_STEPS)
+                if tried.log_likelihood > found.point.log_likelihood and tried.maximum.away < close:
+                    small = _small_field(rough, tried.maximum.point)
+                    if small is None:
+                        return tried
+                    found = replace(found, point=small)
+        if found.away >= close:  # a longer run knows the curvature of its last step, by which scoring alone goes to and fro
+            found = maximise(rough, found.point.x, close=close, widths=(), progress=progress)
+        best = StateSpaceFit(rough, found)
+        if smooth is False:
+            return best
+        if tried is None:
+            there = plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood
+            if smooth or there > found.point.log_likelihood - HOPELESS:
+                tried = without_field(SCORING_STEPS)
+            elif found.point.x[at] < faint:  # an oscillation is integrated more closely: its narrow maximum is next to this
+                tried = without_field(TRIAL_STEPS)
+        if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
+            return best
+        if tried.maximum.away < close:
+            return tried
+        return self.maximised(plain, tried.maximum.point.x)
+
+    def beside_small_field(self, fitted: StateSpaceFit) -> StateSpaceFit:
+        """Return where a small field beside a fit without one leads, yet to be maximised; the fit where it gains too little."""
+        rough = self.likelihood(False, fitted.likelihood.processes)
+        small = _small_field(rough, fitted.maximum.point)
+        return fitted if small is None else StateSpaceFit(rough, replace(fitted.maximum, point=small))
 
 
 def from_any(rough: Likelihood, starts: Iterable[Array], steps: int, progress: Callable[[str], None]) -> Maximum | None:
@@ -1522,36 +1564,6 @@ def _beside(likelihood: Likelihood, maximum: Maximum, j: int) -> tuple[Point, Ar
     return points[int(np.argmax(found))], beyond * np.outer(column, column)
 
 
-def _with_colour(
-    best: StateSpaceFit,
-    likelihood: Callable[[bool, Sequence[str]], Likelihood],
-    progress: Callable[[str], None],
-    cautious: bool = False,
-    least: float = -np.inf,
-) -> StateSpaceFit:
-    """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants; if `cautious`, see there.
-
-    One whose correlation falls off exponentially is tried first, an oscillation where that leaves most stretches correlated: what
-    the physics lack leaves a few. No more are tried where as many as there may be, each with the gain of the last, would leave
-    the log likelihood below `least`.
-    """
-    while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > DEVIATION:
-        if cautious and known and not steadily_coloured(best, cautious):
-            break
-        found = best
-        for kind in PROCESSES:
-            wider = _coloured(best, likelihood(best.smooth, (*known, kind)), progress)
-            found = max(found, wider, key=lambda f: f.criterion)
-            if not steadily_coloured(wider, cautious):
-                break
-        if found is best:
-            break
-        last, best = found.maximum.expected - best.maximum.expected, found
-        if found.maximum.expected + max(last, 0.0) * (GAUGE_PROCESSES - len(found.likelihood.processes)) < least:
-            break
-    return best
-
-
 def with_less_colour(found: StateSpaceFit, close: float, progress: Callable[[str], None] = lambda text: None) -> StateSpaceFit:
     """Return a fit without the fainter processes of its coloured gauge noise, as far as Schwarz's criterion prefers that.
 
@@ -1605,7 +1617,8 @@ def steadily_coloured(found: StateSpaceFit, cautious: bool = False) -> bool:
     point = found.maximum.point
     if correlated(point) < DEVIATION:
         return False
-    judged = [portmanteau(piece) > SYSTEMATIC for f in point.runs for white in f.parts for piece in cut(white)]
+    pieces = [piece for f in point.runs for white in f.parts for piece in cut(white)]
+    judged = [(_ljung_box(piece) - LAGS) / np.sqrt(2 * LAGS) > SYSTEMATIC for piece in pieces]
     if 2 * sum(judged) > len(judged):
         return True
     lines = [(kind, at) for kind, (height, at) in _lines(found).items() if height > DEVIATION]
@@ -1642,13 +1655,8 @@ def _shown(found: StateSpaceFit, kind: Kind, frequency: float) -> bool:
     return 2 * sum(any(abs(c[0] - frequency) < within for c in colours) for colours in seen) > len(seen)
 
 
-def portmanteau(white: Array) -> float:
-    """Return how far the correlations at the first LAGS lags are from those of white noise: Ljung and Box's Q, standardised."""
-    return (_ljung_box(white) - LAGS) / np.sqrt(2 * LAGS)
-
-
 def lag_correlations(parts: Sequence[Array]) -> float:
-    """Return the same of all parts together as a normal deviate (Wilson and Hilferty 1931); those of few readings aside."""
+    """Return Ljung and Box's Q of all parts together as a normal deviate (Wilson and Hilferty 1931); of few readings aside."""
     long = [white for white in parts if white.size > 5 * LAGS]
     if not long:
         return 0.0
@@ -1657,6 +1665,7 @@ def lag_correlations(parts: Sequence[Array]) -> float:
 
 
 def _ljung_box(white: Array) -> float:
+    """Return Q: how far the correlations at the first LAGS lags are from those of white noise, LAGS on average under that."""
     n, c = white.size, np.clip(white, -5.0, 5.0)
     square = float(c @ c)
     return sum(n * (n + 2) / (n - k) * (float(c[k:] @ c[:-k]) / square) ** 2 for k in range(1, LAGS + 1)) if square else 0.0
@@ -1665,76 +1674,6 @@ def _ljung_box(white: Array) -> float:
 def cut(white: Array) -> list[Array]:
     """Return innovations (m,) in stretches that are long enough to be judged each, at most 20."""
     return np.array_split(white, max(min(20, white.size // 50), 1))
-
-
-def _with_or_without(
-    begun: StateSpaceFit,
-    smooth: bool | None,
-    likelihood: Callable[[bool, Sequence[str]], Likelihood],
-    close: float,
-    progress: Callable[[str], None],
-) -> StateSpaceFit:
-    """Return the fit from where one begun stands, with a field or without, as `smooth` says or the likelihood."""
-    rough = begun.likelihood
-    if rough.smooth:
-        own = maximise(rough, begun.maximum.point.x, close=close, progress=progress)
-        return StateSpaceFit(rough, own)
-    plain = likelihood(True, rough.processes)
-    at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
-    faint = _amplitude(rough, FAINT_FIELD)
-
-    def without_field(steps: int) -> StateSpaceFit:
-        progress("without a field")
-        values = plain.coordinates(found.point.values)
-        own = maximise(plain, values, steps=steps, close=close, progress=progress)
-        return StateSpaceFit(plain, own)
-
-    tried: StateSpaceFit | None = None
-    if not np.isfinite(found.away):
-        found = maximise(rough, found.point.x, close=close, progress=progress)
-    elsewhere = False  # a field finer than the samples, or one that is slow, may be a maximum of its own
-    while rough.evaluations - before < SCORING_STEPS:
-        last = found.point.x
-        found = maximise(rough, last, steps=3, close=close, widths=(), progress=progress)
-        if found.away < close or np.array_equal(found.point.x, last):
-            other = None if elsewhere else _small_field(rough, found.point)
-            if other is None:
-                break
-            elsewhere, found = True, replace(found, point=other)
-            continue
-        if found.point.x[at] < last[at] - FIELD_SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
-            found = replace(found, point=_shrunk(rough, found.point, at))
-        if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
-            tried = without_field(TRIAL_STEPS)
-            if tried.log_likelihood > found.point.log_likelihood and tried.maximum.away < close:
-                small = _small_field(rough, tried.maximum.point)
-                if small is None:
-                    return tried
-                found = replace(found, point=small)
-    if found.away >= close:  # a longer run knows the curvature of its last step, by which scoring alone goes to and fro
-        found = maximise(rough, found.point.x, close=close, widths=(), progress=progress)
-    best = StateSpaceFit(rough, found)
-    if smooth is False:
-        return best
-    if tried is None:
-        there = plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood
-        if smooth or there > found.point.log_likelihood - HOPELESS:
-            tried = without_field(SCORING_STEPS)
-        elif found.point.x[at] < faint:  # an oscillation is integrated more closely, so that its narrow maximum is next to this
-            tried = without_field(TRIAL_STEPS)
-    if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
-        return best
-    if tried.maximum.away < close:
-        return tried
-    own = maximise(plain, tried.maximum.point.x, close=close, progress=progress)
-    return StateSpaceFit(plain, own)
-
-
-def _beside_small_field(fitted: StateSpaceFit, likelihood: Callable[[bool, Sequence[str]], Likelihood]) -> StateSpaceFit:
-    """Return where a small field beside a fit without one leads, yet to be maximised; the fit where it gains too little."""
-    rough = likelihood(False, fitted.likelihood.processes)
-    small = _small_field(rough, fitted.maximum.point)
-    return fitted if small is None else StateSpaceFit(rough, replace(fitted.maximum, point=small))
 
 
 def _small_field(rough: Likelihood, plain: Point) -> Point | None:
@@ -1782,7 +1721,9 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
         low, high = (float(side[owns[0][row[0]]]) for side in (wider.lower, wider.upper))
         starts: list[list[tuple[float, ...]]] = [[(low + share * (high - low),) for share in CORRELATION_TIMES]] * len(owns)
     else:
-        starts = [[*product(np.log(peaks), np.log(QUALITIES))] for peaks in _peaks(fitted, wider.kinds)]
+        lines = _lines(fitted)  # where innovations are strongest, and two other frequencies
+        peaks = [[lines[of][1] if of in lines else 0.05 / of[1], 0.03 / of[1], 0.15 / of[1]] for of in wider.kinds]
+        starts = [[*product(np.log(own), np.log(QUALITIES))] for own in peaks]
     best = -np.inf
     for base in _slow_fields(wider, x):
         likeliest = [(-np.inf, base)] * len(owns)
@@ -1805,12 +1746,6 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
     steps = 20 if best > fitted.log_likelihood - HOPELESS else 0
     maximum = maximise(wider, x, steps=steps, close=1.0, progress=progress)
     return StateSpaceFit(wider, maximum)
-
-
-def _peaks(fitted: StateSpaceFit, kinds: Sequence[Kind]) -> list[list[float]]:
-    """Return, for each kind, frequencies (Hz) at which an oscillation may be: where innovations are strongest, and two others."""
-    lines = _lines(fitted)
-    return [[lines[of][1] if of in lines else 0.05 / of[1], 0.03 / of[1], 0.15 / of[1]] for of in kinds]
 
 
 def _slow_fields(wider: Likelihood, x: Array) -> Iterator[Array]:
@@ -1907,7 +1842,6 @@ def _run_fit(likelihood: Likelihood, f: Filtered, number: int, values: Mapping[s
     colours = tuple(colour for colour in every if colour[1] > 0.1 * level)
     with np.errstate(invalid="ignore"):
         residual = found.nu / np.sqrt(found.S) * levels[rate]
+    parts, noise = stretches(run.t, signal.used & np.isfinite(residual)), Noise(level, (), level)
     y = signal.observed - found.nu
-    parts = stretches(run.t, signal.used & np.isfinite(residual))
-    prediction = Prediction(y, np.zeros((y.size, 0)), np.zeros((y.size, 0)), Status.OK, float(run.t[-1]))
-    return RunFit(run.name, run.holdout, prediction, residual, parts, Noise(level, (), level), level, colours, signal.observable)
+    return RunFit(run.name, run.holdout, y, residual, parts, noise, level, colours, signal.observable)

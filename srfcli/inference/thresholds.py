@@ -108,6 +108,14 @@ class _Line:
         """Return whether coordinates `y` are so far from the survey that another crossing may have appeared."""
         return self.surveyed is None or self.rates is None or float(self.rates @ np.abs(y - self.surveyed)) > SURVEY_REACH
 
+    def reach(self, y: Array) -> float:
+        """Return the factor around the datum within which a crossing nearer than the one just followed to `y` must lie.
+
+        That of a usual survey where no crossing was followed there, or so far that such a survey costs no more.
+        """
+        near = [abs(c.load / self.datum - 1) for c in self.odd if c.y is y]
+        return min(1.02 / (1 - min(near)), NEAR_LOADS) if near and min(near) < 0.9 else NEAR_LOADS
+
 
 class Matcher:
     """Compares a table with a model at one parameter set after another; `surveys` counts lines searched in full."""
@@ -146,15 +154,12 @@ class Matcher:
         forced = p[self.model.index("eps")] > 0
         wanted = set(range(len(self.table))) if anew else self._follow(y, p, forced)
         for i in sorted(wanted & set(np.nonzero(forced)[0].tolist())):
-            self._survey(self._lines[i], y, p[:, i], None if anew else wanted_reach(self._lines[i], y))
+            self._survey(self._lines[i], y, p[:, i], NEAR_LOADS if anew else self._lines[i].reach(y))
         for i in np.nonzero(~forced)[0].tolist():
             self._at_rest(self._lines[i], y, p[:, i])
         self._predict(np.nonzero(forced)[0].tolist())
         for line in (self._lines[i] for i in wanted):
             line.rates = np.abs(line.ranked[0].rates) if line.odd and line.ranked[0].rates is not None else None
-        return self._result(y)
-
-    def _result(self, y: Array) -> Match:
         n = len(self.table)
         loads, rivals, chosen = np.full(n, np.nan), np.full(n, np.nan), []
         for i, line in enumerate(self._lines):
@@ -192,10 +197,10 @@ class Matcher:
         if not line.odd:
             line.end = datum * FAR_CROSSING if steady_is_stable(self.model, p, datum / FAR_CROSSING) else datum / FAR_CROSSING
 
-    def _survey(self, line: _Line, y: Array, p: Array, first: float | None) -> None:
+    def _survey(self, line: _Line, y: Array, p: Array, first: float) -> None:
         """Set the odd crossings of a line by a search of its own: near the datum, and further where that decides nothing."""
         datum = line.datum
-        for reach in (NEAR_LOADS, FAR_CROSSING) if first is None else (first, NEAR_LOADS, FAR_CROSSING):
+        for reach in dict.fromkeys((first, NEAR_LOADS, FAR_CROSSING)):
             samples = max(int(2 * np.log(reach) * DENSITY), LEAST_SAMPLES)
             found = critical_line(
                 self.model, p, lo=datum / reach, hi=datum * reach, tol=self.tol, samples=samples, max_mesh=MAX_MESH
@@ -256,16 +261,6 @@ class Matcher:
             rates = self._load_rates([c for _, _, c in same], y, [i for i, _, _ in same])
             for (i, j, c), rate in zip(same, rates, strict=True):
                 self._lines[i].odd[j] = replace(c, rates=rate / c.load)
-
-
-def wanted_reach(line: _Line, y: Array) -> float | None:
-    """Return the factor around the datum within which a crossing nearer than the one just followed to `y` must lie, if known.
-
-    None where no crossing was followed there, or so far that a survey of the usual width costs no more.
-    """
-    near = [abs(c.load / line.datum - 1) for c in line.odd if c.y is y]
-    reach = 1.02 / (1 - min(near)) if near and min(near) < 0.9 else NEAR_LOADS
-    return reach if reach < NEAR_LOADS else None
 
 
 # How a critical load moves with any parameter: exact derivatives, by implicit differentiation of what defines the boundary.
@@ -574,28 +569,14 @@ def _run(matcher: Matcher, method: str, limit: int, report: Report | None) -> Me
                 break
     except KeyboardInterrupt:
         status, surveyed = Status.INTERRUPTED, work.best or surveyed
-    return _finished(matcher, work, first, surveyed, status, notes)
-
-
-def _finished(matcher: Matcher, work: _Work, first: Match, end: Match, status: Status, notes: list[str]) -> MethodFit:
     table, scale = matcher.table, matcher.scale
-    known = uncertainty(scale, end.y, matcher.jacobian(end))
+    before, after = (float(((m.loads - table.W0c) ** 2).sum()) for m in (first, surveyed))
+    known = uncertainty(scale, surveyed.y, matcher.jacobian(surveyed))
     return MethodFit(
-        method=work.trace.method,
-        values=scale.values(end.y),
-        uncertainty=known,
-        match=end,
-        start_cost=first.cost,
-        cost=end.cost,
-        paper_cost=tuple(float(((m.loads - table.W0c) ** 2).sum()) for m in (first, end)),  # type: ignore[arg-type]
-        evaluations=len(work.trace),
-        gradients=work.gradients,
-        surveys=matcher.surveys,
-        cpu=time.process_time() - work.begun,
-        trace=work.trace,
-        status=status,
-        notes=(*work.notes, *notes, *match_notes(table, end)),
-    )
+        method, scale.values(surveyed.y), known, surveyed, start_cost=first.cost, cost=surveyed.cost, paper_cost=(before, after),
+        evaluations=len(work.trace), gradients=work.gradients, surveys=matcher.surveys, cpu=time.process_time() - work.begun,
+        trace=work.trace, status=status, notes=(*work.notes, *notes, *match_notes(table, surveyed)),
+    )  # fmt: skip
 
 
 def match_notes(table: Thresholds, match: Match) -> list[str]:

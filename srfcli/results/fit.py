@@ -396,13 +396,13 @@ class FitResult(Result):
                 unit, recorded = run.unit_of(what), next(s for s in run.signals if s.observable == what).observed
                 above, below = stacked(figure, cell, (2, 1), hspace=0.05)
                 dots = above.plot(run.t, recorded, ".", color="#999999", markersize=3.0, label="recorded", rasterized=True)
-                line = above.plot(run.t, one.prediction.y, color=plots.COLOURS[0], linewidth=0.9, label="model")
+                line = above.plot(run.t, one.y, color=plots.COLOURS[0], linewidth=0.9, label="model")
                 handles = handles or [*dots, *line]
                 above.set_title(plots.name_text(one.name) + (" (held out)" if one.holdout else ""))
                 above.set_ylabel(run.quantity_of(what) + ("" if unit == "1" else f"\n[{unit_text(unit)}]"))
                 above.ticklabel_format(axis="y", useOffset=False)
                 above.tick_params(labelbottom=False)
-                off = (recorded - one.prediction.y) / (noise or 1.0)
+                off = (recorded - one.y) / (noise or 1.0)
                 below.plot(run.t, off, ".", color=plots.COLOURS[1], markersize=2.0, rasterized=True)
                 for level in (-2.0, 2.0) if noise else ():
                     below.axhline(level, color="#000000", linewidth=0.7, linestyle=(0, (1, 1.5)))
