@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,6 @@ class RunView:
     """
 
     run: Run
-    holdout: bool
     baseline: Array
     augmented: Array
     rms: tuple[float, float]
@@ -36,38 +35,39 @@ class RunView:
     others: tuple[tuple[Array, Array], ...] = field(repr=False, default=())
 
     @property
-    def used(self) -> Array:
-        """Return which readings count (n,)."""
-        return self.run.used
+    def size(self) -> int:
+        """Return how many readings count."""
+        return int(self.run.used.sum())
 
 
 def run_views(diagnosis: Diagnosis) -> tuple[RunView, ...]:
     """Return every run under baseline and augmented model, fitted ones first."""
     before, after = diagnosis.shown.fit.maximum.point.runs, diagnosis.best.fit.maximum.point.runs
-    found = [_view(b, a, False) for b, a in zip(before, after, strict=True)]
     same = diagnosis.best is diagnosis.baseline
-    return (*found, *(_view(h.shown, h.shown if same else h.augmented, True) for h in diagnosis.held))
+    held = ((h.shown, h.shown if same else h.augmented) for h in diagnosis.held)
+    return tuple(_view(b, a) for b, a in (*zip(before, after, strict=True), *held))
 
 
-def _view(before: Filtered, after: Filtered, holdout: bool) -> RunView:
+def _view(before: Filtered, after: Filtered) -> RunView:
     run, sides = before.run, (before, after)
     y = [run.observed - f.found.nu for f in sides]
     white = [f.found.nu / np.sqrt(f.found.S) for f in sides]
     rms = [float(np.sqrt(np.mean(w[run.used] ** 2))) for w in white]
     others = tuple((s.observed - before.of(i).nu, s.observed - after.of(i).nu) for i, s in enumerate(run.others, 1))
-    return RunView(replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), (white[0], white[1]), others)
+    return RunView(run, y[0], y[1], (rms[0], rms[1]), (white[0], white[1]), others)
 
 
 def answer(diagnosis: Diagnosis, location: Location, *, discriminating: DiscriminatingRun | None = None) -> dict[str, Any]:
     """Return the object of the format `srf.diagnose/1`; `discriminating` is the run that tells apart what is ambiguous."""
     views, loads, last = run_views(diagnosis), load_views(diagnosis), diagnosis.best
+    held: list[RunView | LoadView] = [*(v for v in views if v.run.holdout), *(v for v in loads if v.loads.holdout)]
     sides = {}
     for place, (name, fitted, own) in enumerate((("baseline", diagnosis.shown, diagnosis.baseline), ("augmented", last, last))):
         values = own.fit.values
         sides[name] = {
             "parameters": parameters_of(fitted),
             "fit": {"rms_over_noise": fitted.fit.maximum.point.rms},
-            "holdout": {"rms_over_noise": together([*(v for v in views if v.holdout), *(v for v in loads if v.holdout)], place)},
+            "holdout": {"rms_over_noise": together(held, place)},
             "field": None if own.fit.smooth else {"amplitude": values["field_amplitude"], "length_um": values["field_length"]},
         }
     found = {
@@ -87,7 +87,8 @@ def answer(diagnosis: Diagnosis, location: Location, *, discriminating: Discrimi
     if loads:
         chi2 = [dict(zip(sides, v.chi2, strict=True)) for v in loads]
         found["thresholds"] = [
-            {"name": v.name, "holdout": v.holdout, "loads": v.used.size, "chi2": c} for v, c in zip(loads, chi2, strict=True)
+            {"name": v.loads.name, "holdout": v.loads.holdout, "loads": v.size, "chi2": c}
+            for v, c in zip(loads, chi2, strict=True)
         ]
     if diagnosis.verdict == "inconclusive":
         found["detectable"] = dict(diagnosis.detectable)
@@ -98,28 +99,22 @@ def answer(diagnosis: Diagnosis, location: Location, *, discriminating: Discrimi
 
 @dataclass(frozen=True)
 class LoadView:
-    """One table of critical loads under both models: arrays (n,) of computed loads, NaN where there is none; rms of residuals."""
+    """One table of critical loads under both models: arrays (n,) of computed loads, NaN where there is none, and chi2."""
 
     loads: CriticalLoads
     baseline: Array
     augmented: Array
     chi2: tuple[float, float]
-    rms: tuple[float, float]
 
     @property
-    def name(self) -> str:
-        """Return the table's name."""
-        return self.loads.name
+    def size(self) -> int:
+        """Return how many loads there are."""
+        return len(self.loads.table)
 
     @property
-    def holdout(self) -> bool:
-        """Return whether it was held out."""
-        return self.loads.holdout
-
-    @property
-    def used(self) -> Array:
-        """Return that every load counts (n,)."""
-        return np.ones(len(self.loads.table), dtype=bool)
+    def rms(self) -> tuple[float, float]:
+        """Return the root mean squares of the residuals over their errors."""
+        return float(np.sqrt(self.chi2[0] / self.size)), float(np.sqrt(self.chi2[1] / self.size))
 
 
 def load_views(diagnosis: Diagnosis) -> tuple[LoadView, ...]:
@@ -130,10 +125,7 @@ def load_views(diagnosis: Diagnosis) -> tuple[LoadView, ...]:
     views = []
     for sides in (*fitted, *held):
         before, after = (np.where(t.match.missing, np.nan, t.match.loads) for t in sides)
-        chi2 = (sides[0].match.cost, sides[1].match.cost)
-        size = sides[0].white.size
-        rms = (float(np.sqrt(chi2[0] / size)), float(np.sqrt(chi2[1] / size)))
-        views.append(LoadView(sides[0].loads, before, after, chi2, rms))
+        views.append(LoadView(sides[0].loads, before, after, (sides[0].match.cost, sides[1].match.cost)))
     return tuple(views)
 
 
@@ -141,7 +133,7 @@ def together(views: Sequence[RunView | LoadView], place: int) -> float | None:
     """Return the root mean square over the noise of several runs and tables together; None of none."""
     if not views:
         return None
-    sizes = np.array([int(v.used.sum()) for v in views], dtype=float)
+    sizes = np.array([v.size for v in views], dtype=float)
     squares = np.array([v.rms[place] ** 2 for v in views])
     return float(np.sqrt(sizes @ squares / sizes.sum()))
 
@@ -153,7 +145,7 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
     runs = []
     for v in run_views(diagnosis):
         runs.append({
-            "name": v.run.name, "holdout": v.holdout, "t": v.run.t, "observed": v.run.observed, "used": v.run.used,
+            "name": v.run.name, "holdout": v.run.holdout, "t": v.run.t, "observed": v.run.observed, "used": v.run.used,
             "baseline": v.baseline, "augmented": v.augmented, "V": v.run.drive(v.run.t),
             "W": v.run.load(v.run.t)[0], "windows": windows.get(v.run.name, []),
             "rms": list(v.rms), "white": list(v.white),
@@ -161,8 +153,8 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
                          for found in friction],  # what a model leaves to its field
         })  # fmt: skip
     tables = [
-        {"name": v.name, "holdout": v.holdout, "table": v.loads.table, "baseline": v.baseline, "augmented": v.augmented,
-         "chi2": list(v.chi2)}
+        {"name": v.loads.name, "holdout": v.loads.holdout, "table": v.loads.table, "baseline": v.baseline,
+         "augmented": v.augmented, "chi2": list(v.chi2)}
         for v in load_views(diagnosis)
     ]  # fmt: skip
     effects = [e for f in (*diagnosis.ranked, diagnosis.best) for e in f.hypothesis.effects]  # variants: the augmented model's
@@ -184,7 +176,7 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
 
 def scan_row(row: Row) -> dict[str, Any]:
     """Return a place of the residual scan, v in um/s and phi in s, by whose logarithms samples were sorted."""
-    found: dict[str, Any] = row.described()
+    found = asdict(row)
     if row.axis in ("v", "phi"):
         found |= {"low": float(np.exp(row.low)), "high": float(np.exp(row.high))}
     return found

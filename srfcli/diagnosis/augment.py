@@ -130,8 +130,7 @@ def _system(
 
 def _final_names(registry: Registry, experiment: Experiment, hypothesis: Hypothesis, laws: MergedLaws) -> dict[str, str]:
     """Return the names that parameters of effects beside the laws have now that some effects are no longer among them."""
-    own = [registry.get("effect", name) for name in experiment.choice.effects]
-    every = [e for e in (*own, *hypothesis.effects) if isinstance(e, Effect)]
+    every = _effects(registry, experiment.choice, hypothesis.effects)
     fitted = {e.name: named for e, named in zip(every, apart(every), strict=True)}
     swap = {}
     for effect, named in zip(laws.left, apart(laws.left), strict=True):
@@ -210,7 +209,7 @@ def merge(registry: Registry, choice: ModelChoice, effects: Sequence[Effect]) ->
     interface = registry.get("interface", str(chosen.get("interface", choice.interface)))
     assert isinstance(friction, FrictionLaw) and isinstance(interface, Interface)
     found = MergedLaws(friction, ageing, interface, changed=frozenset({"ageing"} if modifiers else ()))
-    every = [*(_effect(registry, name) for name in choice.effects), *effects]
+    every = _effects(registry, choice, effects)
     pairs = [(own, named) for own, named in zip(every, apart(every), strict=True) if named.changes or named.states]
     stays: list[Effect] = []
     for own, named in sorted(pairs, key=lambda p: all(slot != "rate" for slot, _ in p[1].changes)):
@@ -224,10 +223,10 @@ def merge(registry: Registry, choice: ModelChoice, effects: Sequence[Effect]) ->
     return replace(found, left=tuple(sorted(found.left, key=lambda e: order[e.name])))
 
 
-def _effect(registry: Registry, name: str) -> Effect:
-    effect = registry.get("effect", name)
-    assert isinstance(effect, Effect)
-    return effect
+def _effects(registry: Registry, choice: ModelChoice, more: Sequence[Effect]) -> list[Effect]:
+    """Return the effects of a choice, and `more`."""
+    own = (registry.get("effect", name) for name in choice.effects)
+    return [*(e for e in own if isinstance(e, Effect)), *more]
 
 
 def _merged(laws: MergedLaws, effect: Effect, stays: Sequence[Effect]) -> MergedLaws | None:

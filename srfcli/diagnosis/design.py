@@ -72,8 +72,8 @@ class DiscriminatingRun:
     unit: str
     noise: float
     predicted: Mapping[str, Array] = field(repr=False)
-    tried: int = 0
-    load_unit: str = "N"
+    tried: int
+    load_unit: str
 
     @property
     def discriminates(self) -> bool:
@@ -137,19 +137,16 @@ class Side:
         found = predict(self.problem.model, self.problem.experiment, run, values)
         return found.y if found.status.ok and np.isfinite(found.y).all() else None
 
-    def filtered(self, run: Run, y: Array, z: Array | None = None, *, slopes: bool = True) -> tuple[Array, Array, Array] | None:
-        """Return innovations over what is shown, `y` (n,), standardised and not, and derivatives (n, k) of the former by z."""
-        seen = replace(run, observed=y)
-        f = self.fitted.fit.likelihood.filtered(seen, self.values(z), slopes=slopes)
+    def loss(self, run: Run, y: Array, z: Array | None = None, *, slopes: bool = True) -> Loss | None:
+        """Return what is lost after steps z (k,) where `y` (n,) is shown, by innovations; None if it cannot be followed."""
+        f = self.fitted.fit.likelihood.filtered(replace(run, observed=y), self.values(z), slopes=slopes)
         if not f.whole:
             return None
-        X = np.zeros((y.size, len(self.names)))
-        if slopes:
-            root = np.sqrt(f.found.S)[:, None]
-            for j, (name, scale) in enumerate(zip(self.names, self.scale, strict=True)):
-                if name in f.names:
-                    X[:, j] = -f.found.nu_d[:, f.names.index(name)] / root[:, 0] * scale
-        return f.white, f.found.nu, X
+        X, size = np.zeros((y.size, len(self.names))), np.sqrt(f.found.S)
+        for j, (name, scale) in enumerate(zip(self.names, self.scale, strict=True)):
+            if name in f.names:
+                X[:, j] = -f.found.nu_d[:, f.names.index(name)] / size * scale
+        return Loss(f.white, X, self.precision, f.found.nu)
 
 
 @dataclass(frozen=True)
@@ -203,6 +200,7 @@ class Design:
 
     def __init__(self, experiment: Experiment, sides: Sequence[Side], seed: int) -> None:
         self.experiment, self.sides = experiment, tuple(sides)
+        self.pairs = list(permutations(sides, 2))  # of a true and a wrong hypothesis
         self.apparatus: Capabilities = capabilities_of(experiment)
         self.rng = np.random.default_rng(seed)
         self.tried = 0
@@ -214,12 +212,8 @@ class Design:
             return None
         near = vary(looked[0].proposal, self.apparatus, varied, self.rng)
         looked = sorted([*looked, *self.look(near, varied, above=looked[0].gain)], key=lambda t: -t.gain)
-        best: DiscriminatingRun | None = None
-        for trial in looked[:CONFIRMED]:
-            found = self.judge(trial)
-            if found is not None and (best is None or found.gain > best.gain):
-                best = found
-        return best and replace(best, tried=self.tried)
+        judged = [found for trial in looked[:CONFIRMED] if (found := self.judge(trial)) is not None]
+        return max(judged, key=lambda found: found.gain, default=None)
 
     def look(self, proposals: Sequence[Proposal], most: int, *, above: float = -1.0) -> list[Trial]:
         """Return runs with their gains at first order, the best first; those that cannot be best are left out."""
@@ -250,11 +244,11 @@ class Design:
                 return None
             y[side.name] = found
         apart = []
-        for true, wrong in self.pairs():
-            seen = wrong.filtered(run, y[true.name], slopes=False)
-            if seen is None:
+        for true, wrong in self.pairs:
+            lost = wrong.loss(run, y[true.name], slopes=False)
+            if lost is None:
                 return None
-            apart.append(0.5 * float(seen[0] @ seen[0]))
+            apart.append(0.5 * float(lost.w @ lost.w))
         return Trial(proposal, run, y, min(apart))
 
     def begun(self, proposal: Proposal) -> tuple[Proposal, Run] | None:
@@ -266,33 +260,30 @@ class Design:
                     return tried, run
         return None
 
-    def pairs(self) -> list[tuple[Side, Side]]:
-        """Return every pair of a true and a wrong hypothesis."""
-        return list(permutations(self.sides, 2))
-
     def gain(self, trial: Trial) -> float:
         """Return the gain at first order: that of the pair least apart, the worse way round."""
         least = np.inf
-        for true, wrong in self.pairs():
-            seen = wrong.filtered(trial.run, trial.y[true.name])
-            if seen is None:
+        for true, wrong in self.pairs:
+            lost = wrong.loss(trial.run, trial.y[true.name])
+            if lost is None:
                 return 0.0
-            least = min(least, Loss(seen[0], seen[2], wrong.precision, seen[1]).gain())
+            least = min(least, lost.gain())
         return least
 
     def judge(self, trial: Trial) -> DiscriminatingRun | None:
         """Return what a run is worth, every wrong model refitted by the motion itself."""
         losses: dict[tuple[str, str], Loss] = {}
-        for true, wrong in self.pairs():
+        for true, wrong in self.pairs:
             lost = self.refitted(trial.run, wrong, trial.y[true.name])
             if lost is None:
                 return None
             losses[true.name, wrong.name] = lost
-        wrongs = {s.name: float(s.values()[s.fitted.fit.likelihood.gauges(trial.run)[0]["gauge_white"]]) for s in self.sides}
         worth = {pair: lost.gain() for pair, lost in losses.items()}
         true_name, wrong_name = min(worth, key=lambda pair: worth[pair])
         seconds, repeats = _enough(list(losses.values()), trial)
         names, run = tuple(s.name for s in self.sides), trial.run
+        wrong = self.sides[names.index(wrong_name)]
+        noise = float(wrong.values()[wrong.fitted.fit.likelihood.gauges(run)[0]["gauge_white"]])
         first, second = sorted((true_name, wrong_name), key=names.index)
         left = losses[true_name, wrong_name].left * (1.0 if true_name == first else -1.0)
         at = int(np.argmax(np.abs(left)))
@@ -302,36 +293,35 @@ class Design:
             {a: min(g for (true, _), g in worth.items() if true == a) for a in names}, seconds, repeats, (first, second),
             float(run.t[at]), float(left[at]), abs(float(left[at])) / factor,
             shown_unit(OBSERVABLES[run.observable], stress=self.experiment.stress),
-            wrongs[wrong_name], trial.y, load_unit=shown_unit("N", stress=self.experiment.stress),
+            noise, trial.y, self.tried, shown_unit("N", stress=self.experiment.stress),
         )  # fmt: skip
 
     def refitted(self, run: Run, wrong: Side, y: Array) -> Loss | None:
         """Return what a wrong model loses once it was fitted to what the true one shows, and to all that it is known from."""
         Q = wrong.precision
         z, damping = np.zeros(Q.shape[0]), 0.0
-        current = wrong.filtered(run, y, z)
-        if current is None:
+        lost = wrong.loss(run, y, z)
+        if lost is None:
             return None
-        r, left, X = current
         for _ in range(NEWTON_ROUNDS):
-            A, b = X.T @ X + Q, X.T @ r - Q @ z
+            A, b = lost.X.T @ lost.X + Q, lost.X.T @ lost.w - Q @ z
             A[np.diag_indices_from(A)] *= 1 + damping
             step = solve_scaled(A, b)
-            if float(b @ step) < 0.02 * (1 + float(r @ r + z @ Q @ z)) and not damping:
+            if float(b @ step) < 0.02 * (1 + _cost(lost, z)) and not damping:
                 break
-            trial = wrong.filtered(run, y, z + step)
-            if trial is not None and _cost(trial[0], z + step, Q) < _cost(r, z, Q):
-                (r, left, X), z = trial, z + step
+            trial = wrong.loss(run, y, z + step)
+            if trial is not None and _cost(trial, z + step) < _cost(lost, z):
+                lost, z = trial, z + step
                 damping = 0.0 if damping < 1e-3 else damping / 10
             elif damping > 1e4:
                 break
             else:
                 damping = max(10 * damping, 1e-2)
-        return Loss(r + X @ z, X, Q, left)
+        return replace(lost, w=lost.w + lost.X @ z)
 
 
-def _cost(r: Array, z: Array, Q: Array) -> float:
-    return float(r @ r + z @ Q @ z)
+def _cost(lost: Loss, z: Array) -> float:
+    return float(lost.w @ lost.w + z @ lost.Q @ z)
 
 
 def _enough(losses: Sequence[Loss], trial: Trial) -> tuple[float | None, int | None]:
@@ -549,24 +539,22 @@ def _drawn(apparatus: Capabilities, kind: str, rng: np.random.Generator) -> Prop
     W0 = near(apparatus.W0) if set(apparatus.W0) != {UNKNOWN_LOAD} else UNKNOWN_LOAD
     rise = apparatus.switch if kind == WAVE else apparatus.rise
     if kind == STEPS:
-        drive = _timed([V, other, V, third], [0.25] * 4, span, apparatus.travel)
-        return Proposal(kind, drive, W0, like.name, interval, rise)
-    if kind == HOLD:
-        drive = _timed([V, 0.0, V], [0.2, rng.uniform(0.3, 0.6), 0.2], span, apparatus.travel)
-        return Proposal(kind, drive, W0, like.name, interval, rise)
+        velocities, shares = [V, other, V, third], [0.25] * 4
+    elif kind == HOLD:
+        velocities, shares = [V, 0.0, V], [0.2, rng.uniform(0.3, 0.6), 0.2]
+    elif kind == LOAD or rng.uniform() >= 0.4:
+        velocities, shares = [V], [1.0]
+    else:
+        velocities, shares = [V, other], [0.6, 0.4]
+    made = Proposal(kind, _timed(velocities, shares, span, apparatus.travel), W0, like.name, interval, rise)
     if kind == LOAD:
-        drive = _timed([V], [1.0], span, apparatus.travel)
         jump = _digits(near(apparatus.jumps) * W0 * (1 if rng.uniform() < 0.6 else -1))
-        length = sum(d for d, _ in drive)
-        steps = ((_digits(0.3 * length), jump), (_digits(0.65 * length), -jump))
-        return Proposal(kind, drive, W0, like.name, interval, rise, _allowed(W0, steps, apparatus))
-    stepped = rng.uniform() < 0.4
-    drive = _timed([V, other], [0.6, 0.4], span, apparatus.travel) if stepped else _timed([V], [1.0], span, apparatus.travel)
-    onset = _digits(min(apparatus.onset, 0.5) * sum(d for d, _ in drive))
-    eps = min(near(apparatus.eps), MOST_EPS)
-    return Proposal(
-        kind, drive, W0, like.name, interval, rise, (), eps, _frequency(near(apparatus.f), apparatus, interval), onset
-    )
+        steps = ((_digits(0.3 * made.duration), jump), (_digits(0.65 * made.duration), -jump))
+        return replace(made, steps=_allowed(W0, steps, apparatus))
+    if kind == WAVE:
+        onset, eps = _digits(min(apparatus.onset, 0.5) * made.duration), min(near(apparatus.eps), MOST_EPS)
+        return replace(made, eps=eps, f=_frequency(near(apparatus.f), apparatus, interval), onset=onset)
+    return made
 
 
 def _timed(V: Sequence[float], shares: Sequence[float], span: float, travel: float) -> tuple[tuple[float, float], ...]:

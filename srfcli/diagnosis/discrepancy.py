@@ -64,14 +64,12 @@ class RunForce:
 
     def described(self) -> dict[str, Array]:
         """Return all arrays by name; the band also as `band` (2, n)."""
-        found = {k: getattr(self, k) for k in self.__dataclass_fields__}
-        return found | {"band": np.vstack([self.low, self.high])}
+        return {**vars(self), "band": np.vstack([self.low, self.high])}
 
     def csv(self) -> str:
         """Return the run as a table, in full precision."""
         heads = ("time [s]", "friction", "low", "high", "v [um/s]", "phi [s]", "W [N]", "dlnWdt [1/s]", "slip [um]")
-        columns = (self.t, self.force, self.low, self.high, self.v, self.phi, self.W, self.dlnWdt, self.slip)
-        rows = (",".join(map(repr, row)) for row in zip(*(c.tolist() for c in columns), strict=True))
+        rows = (",".join(map(repr, row)) for row in zip(*(column.tolist() for column in vars(self).values()), strict=True))
         return "\n".join([",".join(heads), *rows]) + "\n"
 
 

@@ -73,16 +73,13 @@ def uneven_noise(found: StateSpaceFit) -> list[str]:
 def coarse_readings(found: StateSpaceFit) -> list[str]:
     """Return what to say of gauges whose readings are rounded to steps that noise does not blur: rounding is no noise then."""
     runs = found.likelihood.problem.runs
-    coarse = [run.name for run in runs if any(s.quantum and _repeated(s.observed[s.used], s.quantum) for s in run.signals)]
+    rounded = [(run.name, s) for run in runs for s in run.signals if s.quantum]
+    repeats = [(name, np.mean(np.abs(np.diff(s.observed[s.used])) < 0.5 * s.quantum)) for name, s in rounded]
+    coarse = list(dict.fromkeys(name for name, share in repeats if share > REPEATED))
     if not coarse:
         return []
     steps = "are rounded to steps of more than four times the noise: values may be off by several of their errors"
     return [f"readings of {', '.join(coarse)} {steps}"]
-
-
-def _repeated(x: Array, quantum: float) -> bool:
-    """Return whether as many readings (n,) repeat the one before as under steps of more than four times the noise."""
-    return float(np.mean(np.abs(np.diff(x)) < 0.5 * quantum)) > REPEATED
 
 
 def field_share(found: StateSpaceFit) -> float:

@@ -74,10 +74,10 @@ class Location:
         }
 
 
-def locate(fitted: Fitted, *, last: Fitted | None = None, draws: int = DRAWS, seed: int = 0) -> Location:
+def locate(fitted: Fitted, *, last: Fitted | None = None, seed: int = 0) -> Location:
     """Return where the recordings part from a fitted model, with error control over everything that is looked at.
 
-    `draws` recordings with nothing but noise are simulated through the same projection. Of a model that is known to be better,
+    DRAWS recordings with nothing but noise are simulated through the same projection. Of a model that is known to be better,
     `last`, the parameters, the field and the noise are taken, and what is uncertain of them counts as noise. Phases, lines and
     quantities are looked for as long as each run is followed: once cycles are lost, a residual says nothing of them.
     Critical loads have no place.
@@ -86,21 +86,20 @@ def locate(fitted: Fitted, *, last: Fitted | None = None, draws: int = DRAWS, se
     if not likelihood.problem.runs:
         return Location((), None, (), None, 1.0)
     forcing = {r.name: of_run(r)["f"] for r in likelihood.problem.runs if of_run(r)["modulated"]}
+    if last is not None:
+        values = {n: last.fit.values.get(n, v) for n, v in values.items()}  # on a smooth track its field is of amplitude 0
+    pieces = pieces_of(fitted, values)
+
+    def of(some: Sequence[Piece]) -> Location:
+        scan = ResidualScan(some, len(likelihood.names), kept=last is not None)
+        return stands_out(scan, scan.projected([p.white for p in some]), scan.null(DRAWS, seed=seed), forcing)
+
+    whole = of(pieces)
     if last is None:
-        pieces = pieces_of(fitted, values)
-        scan = ResidualScan(pieces, len(likelihood.names))
-        return stands_out(scan, scan.projected([p.white for p in pieces]), scan.null(draws, seed=seed), forcing)
-    values = {n: last.fit.values.get(n, v) for n, v in values.items()}  # on a smooth track its field is of amplitude 0
-    pieces, k = pieces_of(fitted, values), len(likelihood.names)
-    whole, begun = (_read_kept(some, k, forcing, draws, seed) for some in (pieces, [p.followed() for p in pieces]))
+        return whole
+    begun = of([p.followed() for p in pieces])
     rows = [r for r in whole.rows if r.axis in OWN] + [r for r in begun.rows if r.axis not in OWN]
     return replace(begun, runs=whole.runs, p_value=min(whole.p_value, begun.p_value), rows=tuple(rows))
-
-
-def _read_kept(pieces: Sequence[Piece], k: int, forcing: Mapping[str, float], draws: int, seed: int) -> Location:
-    """Return what stands out of residuals as they are."""
-    scan = ResidualScan(pieces, k, kept=True)
-    return stands_out(scan, scan.projected([p.white for p in pieces]), scan.null(draws, seed=seed), forcing)
 
 
 def stands_out(scan: ResidualScan, M: Sequence[Array], null: Array, forcing: Mapping[str, float]) -> Location:
@@ -121,7 +120,7 @@ def stands_out(scan: ResidualScan, M: Sequence[Array], null: Array, forcing: Map
         _lines(rows, scan, forcing),
         _coordinate(rows, scan, M),
         min(r.p_value for r in rows),
-        _kept(rows),
+        tuple(r for r in rows if r.kind != "line" or r.p_value < SIGNIFICANT),  # without lines of spectra in which nothing is
     )
 
 
@@ -216,11 +215,6 @@ def _coordinate(rows: Sequence[Row], scan: ResidualScan, M: Sequence[Array]) -> 
         return None
     best = max(smooth, key=lambda r: r.statistic - r.freedom)
     return best.axis, float(np.clip((best.statistic - best.freedom) / left, 0.0, 1.0))
-
-
-def _kept(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Return the rows without the lines of the spectra in which nothing is."""
-    return tuple(r for r in rows if r.kind != "line" or r.p_value < SIGNIFICANT)
 
 
 # A fit's runs as pieces of a scan: residuals and columns, whitened, with what their samples can be sorted by.
@@ -342,10 +336,6 @@ class Row:
     z: float | None
     log_p: float
     p_value: float
-
-    def described(self) -> dict[str, object]:
-        """Return the row as plain data."""
-        return {k: getattr(self, k) for k in self.__dataclass_fields__}
 
 
 @dataclass(frozen=True)
@@ -516,7 +506,7 @@ class ResidualScan:
                     where, span = slice(a, a + length), ((float(p.t[a]), float(p.t[a + length - 1])),)
                     waves = np.cos(np.pi * np.outer((np.arange(length) + 0.5) / length, np.arange(min(WAVES, length))))
                     axis = "window" if halving else "run"
-                    found.append(self._linear(axis, p.name, "shape", span, [(i, where, waves)], [(0, waves.shape[1])]))
+                    found.append(self._linear(axis, p.name, "shape", span, [(i, where, waves)]))
                     found.append(self._power(axis, p.name, span, [(i, where, np.ones((length, 1)))]))
         return found
 
@@ -536,7 +526,11 @@ class ResidualScan:
             edges = np.unique(np.quantile(every, np.linspace(0.0, 1.0, BINS + 1)))
             edges = edges[np.concatenate([[True], np.diff(edges) > 1e-9 * max(float(np.ptp(every)), 1e-300)])]
             if edges.size > 2:
-                found += [*self._binned(name, "", chosen, edges), self._smooth(name, chosen, edges)]
+                hats = np.eye(edges.size)  # any function that is linear between the edges has one statistic
+                parts = [(i, slice(None), np.column_stack([np.interp(x, edges, hat) for hat in hats])) for i, x in chosen]
+                found += self._binned(name, "", chosen, edges)
+                span = ((float(edges[0]), float(edges[-1])),)
+                found.append(self._linear(name, "", "shape", span, parts))
         return found
 
     def _binned(self, axis: str, run: str, chosen: Sequence[tuple[int, Array]], edges: Array) -> list[_Item]:
@@ -551,34 +545,27 @@ class ResidualScan:
         if not spans:
             return []
         parts = [(i, s, H[:, filled].astype(float)) for i, s, H in parts]
-        singles = [(k, k + 1) for k in range(len(spans))]
         means = parts
         if axis in ("forcing", "cycle"):  # what is the same at every phase has nothing to do with it
             means = [(i, s, H - H.mean(axis=0) * (H.sum(axis=1, keepdims=True) > 0) * (H.shape[0] / max(H.sum(), 1.0)))
                      for i, s, H in parts]  # fmt: skip
-        return [self._linear(axis, run, "mean", spans, means, singles), self._power(axis, run, spans, parts)]
-
-    def _smooth(self, axis: str, chosen: Sequence[tuple[int, Array]], knots: Array) -> _Item:
-        """Return the one statistic of any function that is linear between `knots`."""
-        eye = np.eye(knots.size)
-        parts = [(i, slice(None), np.column_stack([np.interp(x, knots, row) for row in eye])) for i, x in chosen]
-        return self._linear(axis, "", "shape", ((float(knots[0]), float(knots[-1])),), parts, [(0, knots.size)])
+        return [self._linear(axis, run, "mean", spans, means), self._power(axis, run, spans, parts)]
 
     def _linear(self, axis: str, run: str, kind: str, spans: tuple[tuple[float, float], ...],
-                parts: Sequence[tuple[int, slice, Array]], groups: Sequence[tuple[int, int]]) -> _Item:  # fmt: skip
-        """Return the statistics of groups of columns, with the roots of (B'M B)^-1."""
+                parts: Sequence[tuple[int, slice, Array]]) -> _Item:  # fmt: skip
+        """Return the statistic of each column of a `mean`, or that of all together, with the roots of (B'M B)^-1."""
         q, k = parts[0][2].shape[1], self.k
-        white, C, G = [], np.zeros((q, k)), np.zeros((q, q))
+        groups = tuple((a, a + 1) for a in range(q)) if kind == "mean" else ((0, q),)
+        C, G = np.zeros((q, k)), np.zeros((q, q))
         for i, s, B in parts:
             p = self.pieces[i]
-            white.append((i, s, B))
             C[:, p.places] += B.T @ p.X[s]
             G += B.T @ B
         scale = np.sqrt(np.maximum(np.diag(G), 1e-300))  # before parameters and track absorb what they can
         G = (G - C @ self.inverse @ C.T) / np.outer(scale, scale)
         roots = [_inverse_root(G[a:b, a:b], scale[a:b]) for a, b in groups]
         ranks = np.array([rank for _, rank in roots], dtype=float)
-        return _Item(axis, run, kind, spans, tuple(white), tuple(groups), tuple(root for root, _ in roots), ranks)
+        return _Item(axis, run, kind, spans, tuple(parts), groups, tuple(root for root, _ in roots), ranks)
 
     def _power(
         self, axis: str, run: str, spans: tuple[tuple[float, float], ...], parts: Sequence[tuple[int, slice, Array]]

@@ -100,12 +100,12 @@ class Remainder:
 
     def __init__(self, fitted: StateSpaceFit) -> None:
         self.fitted, point = fitted, fitted.maximum.point
-        recorded = [_stacked(f.white, (f.white**2 - 1) / np.sqrt(2)) for f in point.runs]
+        recorded = [np.concatenate([f.white, (f.white**2 - 1) / np.sqrt(2)]) for f in point.runs]
         self.rest = np.concatenate([*recorded, *(t.white for t in point.tables)])
         base = np.zeros((self.rest.size, len(fitted.likelihood.names)))
         at = 0
         for f in point.runs:
-            block = _stacked(*_whitened(f))
+            block = _whitened(f)
             base[at : at + len(block), [fitted.likelihood.names.index(n) for n in f.names]] = block
             at += len(block)
         for t in point.tables:
@@ -187,7 +187,7 @@ def own_values(remainder: Remainder) -> list[OwnValue]:
     for f in runs if len(runs) > 1 else ():
         shared = [n for n in f.names if n in names and "[" not in n and not n.startswith(f"{f.run.name}.")]
         columns = np.zeros((remainder.rest.size, len(shared)))
-        columns[end : end + 2 * f.white.size] = _stacked(*_whitened(f))[:, [f.names.index(n) for n in shared]]
+        columns[end : end + 2 * f.white.size] = _whitened(f)[:, [f.names.index(n) for n in shared]]
         end += 2 * f.white.size
         free = remainder.free(columns)
         power, g = np.sum(free**2, axis=0), free.T @ remainder.left
@@ -273,7 +273,7 @@ class Scores:
             found = filter_run(
                 model, self.experiment, run, own | begun, by=by, gauges=likelihood.gauges(run), trend=trend, rtol=likelihood.rtol
             )
-            return _stacked(*_whitened(found))
+            return _whitened(found)
 
         return np.concatenate([*likelihood.over_runs(block), *self._load_columns(added, values, by)])
 
@@ -309,7 +309,7 @@ class Scores:
             half = len(effects) // 2
             return self._derived(effects[:half]) + self._derived(effects[half:])
         longs = {e.name: {p.name: long for long, p in own_parameters(e, model).items()} for e in effects}
-        grids = {e.name: [inner for group in _phases(inner_grid(e)) for inner in group] for e in effects}
+        grids = {e.name: [inner for group in _phases(e) for inner in group] for e in effects}
         columns: dict[str, list[Array]] = {e.name: [] for e in effects}
         for j in range(max(len(grid) for grid in grids.values())):
             some = [e for e in effects if j < len(grids[e.name])]
@@ -318,30 +318,15 @@ class Scores:
             found = self._columns(model, effects, self._neutral(model, effects) | inner, sizes)
             for k, e in enumerate(some):
                 columns[e.name].append(found[:, k])
-        made = []
-        for e in effects:
-            at = 0
-            for group in _phases(inner_grid(e)):
-                block = np.stack(columns[e.name][at : at + len(group)], axis=1)
-                made.append(_Column(e, e.sizes[0], group[0], block))
-                at += len(group)
-        return made
+        return [column for e in effects for column in _by_phase(e, np.stack(columns[e.name], axis=1))]
 
     def _along(self, effects: Sequence[Effect], shapes: Mapping[str, Shape]) -> list[_Column]:
         """Return the columns of effects that are functions of slip, time or stage position, for all inner values."""
-        wanted = [(e, group) for e in effects for group in _phases(inner_grid(e))]
-        blocks = []
-        for f in self.remainder.runs:
-            functions = [
-                (shapes[e.name], [inner.get(n, 0.0) for n in shapes[e.name].inner]) for e, group in wanted for inner in group
-            ]
-            blocks.append(_carried(f, self.fitted, functions))
-        every = self.remainder.padded(blocks)
-        found, at = [], 0
-        for effect, group in wanted:
-            found.append(_Column(effect, effect.sizes[0], group[0], every[:, at : at + len(group)]))
-            at += len(group)
-        return found
+        grids = [(shapes[e.name], [inner for group in _phases(e) for inner in group]) for e in effects]
+        functions = [(shape, [inner.get(n, 0.0) for n in shape.inner]) for shape, grid in grids for inner in grid]
+        every = self.remainder.padded([_carried(f, self.fitted, functions) for f in self.remainder.runs])
+        parts = np.split(every, np.cumsum([len(grid) for _, grid in grids])[:-1], axis=1)
+        return [column for e, columns in zip(effects, parts, strict=True) for column in _by_phase(e, columns)]
 
     @cached_property
     def alone(self) -> list[Score]:
@@ -480,22 +465,25 @@ def may_befall_one_run(effect: Effect) -> bool:
     return not (effect.constitutive or effect.frees or effect.settings or elastic)
 
 
-def _stacked(innovations: Array, variances: Array) -> Array:
-    return np.concatenate([innovations, variances])
-
-
-def _whitened(f: Filtered) -> tuple[Array, Array]:
-    """Return the derivatives (m, k) whose product with [white, (white^2 - 1)/sqrt 2] is the score."""
+def _whitened(f: Filtered) -> Array:
+    """Return the derivatives (2 m, k) whose product with [white, (white^2 - 1)/sqrt 2] is the score."""
     a, b = f.slopes
-    return -a, b / np.sqrt(2)
+    return np.concatenate([-a, b / np.sqrt(2)])
 
 
-def _phases(grid: Sequence[dict[str, float]]) -> list[list[dict[str, float]]]:
-    """Return inner values in groups that differ by their phase alone."""
+def _phases(effect: Effect) -> list[list[dict[str, float]]]:
+    """Return the inner values at which an effect is tried, in groups that differ by their phase alone."""
     groups: dict[tuple[float, ...], list[dict[str, float]]] = {}
-    for inner in grid:
+    for inner in inner_grid(effect):
         groups.setdefault(tuple(v for n, v in inner.items() if n != "phase"), []).append(inner)
     return list(groups.values())
+
+
+def _by_phase(effect: Effect, columns: Array) -> list[_Column]:
+    """Return the columns (n, k) of an effect, one for each of its inner values, those of each group together."""
+    groups = _phases(effect)
+    parts = np.split(columns, np.cumsum([len(group) for group in groups])[:-1], axis=1)
+    return [_Column(effect, effect.sizes[0], group[0], part) for group, part in zip(groups, parts, strict=True)]
 
 
 def _carried(
@@ -550,7 +538,7 @@ def _carried(
     if late:
         out[::signals, -1] += shown
     white = out[f.used] / np.sqrt(every.S[f.used])[:, None]
-    return _stacked(white, np.zeros_like(white))
+    return np.concatenate([white, np.zeros_like(white)])
 
 
 def _elongation_rate(run: Run, x: Array, model: GeneratedModel, fitted: StateSpaceFit) -> Array:

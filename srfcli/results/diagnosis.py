@@ -210,13 +210,13 @@ class DiagnosisResult(Result):
             place = places.get(v.run.name)
             where = "" if place is None else ", ".join(f"{a:.4g} to {b:.4g}" for a, b in place.windows)
             told = (None, None, where) if place is None else (place.share, place.p_value, where)
-            rows.append((v.run.name, "held out" if v.holdout else "fit", *v.rms, *told))
+            rows.append((v.run.name, "held out" if v.run.holdout else "fit", *v.rms, *told))
         return Table("srf.diagnose.runs/1", RUNS, rows, "runs", tuple(_places(self.location)))
 
     @property
     def load_table(self) -> Table:
         """Return what is left of each table of critical loads."""
-        rows = [(v.name, "held out" if v.holdout else "fit", v.used.size, *v.chi2) for v in load_views(self.diagnosis)]
+        rows = [(v.loads.name, "held out" if v.loads.holdout else "fit", v.size, *v.chi2) for v in load_views(self.diagnosis)]
         return Table("srf.diagnose.loads/1", LOADS, rows, "critical loads")
 
     @cached_property

@@ -142,7 +142,9 @@ def answer_case(task: Task) -> Answer:
             warnings.simplefilter("ignore")  # of optimisers under way: the verdict counts
             found = task.diagnose(task.folder, task.plugins)
     except Exception as error:
-        found = failed(task.folder.name, f"{type(error).__name__}: {error}; {_place(error)}")
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{Path(last.filename).name}, line {last.lineno}"
+        found = failed(task.folder.name, f"{type(error).__name__}: {error}; {place}")
     except _TooLong:
         found = failed(task.folder.name, f"more than {task.limit:g} s of CPU")
     cpu, wall = round(_cpu() - used, 3), round(time.perf_counter() - begun, 3)
@@ -189,7 +191,7 @@ def told(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
         tuple(dict.fromkeys(x.effect for x in diagnosis.not_identifiable)),
         {name: {k: _finite(v) for k, v in value.items()} for name, value in added(diagnosis.best, diagnosis.baseline).items()},
         {"baseline": _finite(diagnosis.shown.fit.maximum.point.rms), "augmented": _finite(diagnosis.best.fit.maximum.point.rms)},
-        {view.run.name: _errors(view) for view in views if view.holdout},
+        {view.run.name: _errors(view) for view in views if view.run.holdout},
         {_plain(f.name): _evidence(f) for f in reversed(diagnosis.ranked)},
         diagnosis.ungated,
         run=next(iter(diagnosis.acts_in.values()), ""),
@@ -269,11 +271,6 @@ def _cpu() -> float:
     """Return the seconds of CPU that this process and the compilers it called have used."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
-
-
-def _place(error: Exception) -> str:
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{Path(last.filename).name}, line {last.lineno}"
 
 
 @contextmanager
