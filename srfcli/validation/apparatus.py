@@ -51,7 +51,6 @@ class Rig:
     unit: str = "N"
     factor: float = 1.0
     digits: int = 3  # of what is observed
-    load_digits: int = 6
 
     def start(self, baseline: Physics) -> dict[str, Start]:
         """Return the start values of a baseline's parameters, by the names that its laws' files have."""

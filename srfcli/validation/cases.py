@@ -7,7 +7,7 @@ import hmac
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate, combinations, cycle, islice
 from pathlib import Path
 from typing import Any
@@ -220,8 +220,9 @@ def without(p: Physics, effects: Sequence[Effect]) -> Physics:
 class Asked:
     """What a case is asked to be; what is None is drawn.
 
-    `size` from 0 to 1 is how strong the effects are, `rough` whether the track is, or the standard deviation of its mu0, `own`
-    whether each run has a field of its own; `plans` are the runs, `setting` and `noise` those of a case of the wide bank.
+    `kind` is none, single, pair or outside, in the wide bank also ageing or one-run; `effects` are names. `size` from 0 to 1 is
+    how strong they are, `rough` whether the track is, or the standard deviation of its mu0, `own` whether each run has a field of
+    its own; `plans` are the runs, `setting` and `noise` those of a case of the wide bank.
     """
 
     kind: str | None = None
@@ -477,7 +478,7 @@ def table(plan: Plan, observed: Array, rig: Rig = PAPER) -> str:
     velocities = np.array([v for _, v in plan.drive])
     V = velocities[np.minimum(np.searchsorted(ends, t + 1e-9, side="right"), velocities.size - 1)]
     W = [load(s)[0] / rig.factor for s in t.tolist()]
-    rows = (f"{s:.4f},{v:g},{w:.{rig.load_digits}f},{u:.{rig.digits}f}" for s, v, w, u in zip(t, V, W, observed, strict=True))
+    rows = (f"{s:.4f},{v:g},{w:.6f},{u:.{rig.digits}f}" for s, v, w, u in zip(t, V, W, observed, strict=True))
     header = f"time [s],load_point_velocity [um/s],{rig.load},{rig.heading}"
     return "\n".join([header, *rows]) + "\n"
 
@@ -496,32 +497,17 @@ REDRAWS = 8  # draws until every run of a case can be integrated
 Truth = dict[str, Any]
 
 
-def make_case(
-    folder: Path,
-    seed: int | Sequence[int],
-    *,
-    kind: str | None = None,
-    effects: Sequence[str] | None = None,
-    size: float | None = None,
-    rough: bool | float | None = None,
-    own: bool | None = None,
-    plans: tuple[Plan, ...] | None = None,
-    setting: Setting | None = None,
-    noise: str | None = None,
-    bank: str = "paper",
-) -> Truth:
+def make_case(folder: Path, seed: int | Sequence[int], *, bank: str = "paper", **asked: Any) -> Truth:
     """Write a concealed experiment to the new folder `folder` and return the truth about it, ready for JSON.
 
-    `kind` is none, single, pair or outside, in the wide `bank` also ageing or one-run; `effects` names them; the rest is as in
-    `Asked`. The same seed and choices give the same bytes.
-    Raises SrfError for unknown names, and where the folder exists.
+    What is `asked` for are fields of `Asked`. The same seed and choices give the same bytes. Raises SrfError for unknown names of
+    effects, kinds and banks, and where the folder exists.
     """
     if folder.exists():
         raise SrfError(f"{folder} exists already", "A case is never overwritten; name another folder.")
     if bank not in BANKS:
         raise SrfError(f"unknown bank '{bank}'", did_you_mean(bank, BANKS))
-    asked = Asked(kind, effects, size, rough, own, plans, setting, noise)
-    recipe, motions, attempt = _moving(seed, draw_wide if bank == "wide" else draw_recipe, asked)
+    recipe, motions, attempt = _moving(seed, draw_wide if bank == "wide" else draw_recipe, Asked(**asked))
     rng, rig = np.random.default_rng([*_whole(seed), attempt, 1]), RIGS[recipe.rig]
     readings = {
         plan: read_gauge(recorded(rig, recipe.acting(plan), plan, u), recipe.gauge.louder(plan.loud), rng)
@@ -586,7 +572,7 @@ def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
         "noise": recipe.noise,
         "resembles": sorted({r for e in recipe.effects for r in e.resembles}),
         "sizes": dict(zip(names, recipe.sizes, strict=True)),
-        "truth": _changed(recipe.physics, recipe.baseline),
+        "truth": {n: value for n, value in vars(recipe.physics).items() if value != getattr(recipe.baseline, n)},
         "physics": asdict(recipe.physics),
         "baseline": asdict(recipe.baseline),
         "rough": recipe.physics.track.size,
@@ -596,11 +582,6 @@ def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
         "seed": _whole(seed),
         "attempt": attempt,
     }
-
-
-def _changed(p: Physics, baseline: Physics) -> dict[str, Any]:
-    """Return the fields in which the truth departs from its baseline."""
-    return {f.name: getattr(p, f.name) for f in fields(p) if getattr(p, f.name) != getattr(baseline, f.name)}
 
 
 def known_physics(truth: Mapping[str, Any], *, baseline: bool = False) -> Physics:
@@ -668,7 +649,7 @@ def seal(bank: Path, truths: Mapping[str, Mapping[str, Any]], apart: Path, *, se
 
 def unseal(bank: Path, apart: Path) -> Truths:
     """Return the truths, case -> truth; SrfError where they, or the files of a case, are not those that were sealed."""
-    public = _read(bank / SEAL)
+    public = read_seal(bank)
     if public.get("schema") != SCHEMA:
         raise SrfError(f"{bank / SEAL}: schema {public.get('schema')!r}, expected {SCHEMA!r}", "Is this a bank of cases?")
     data = _bytes(apart)
@@ -687,7 +668,7 @@ def unseal(bank: Path, apart: Path) -> Truths:
 
 def check_cases(bank: Path) -> tuple[str, ...]:
     """Return the names of the cases of a bank; SrfError where a file of one was changed, added or taken away since."""
-    cases: dict[str, str] = _read(bank / SEAL)["cases"]
+    cases: dict[str, str] = read_seal(bank)["cases"]
     for name, digest in cases.items():
         if not (bank / name).is_dir() or case_digest(bank / name) != digest:
             raise SrfError(f"{bank / name}: not the files that were sealed", "Restore the case, or make the bank anew.")
@@ -714,7 +695,9 @@ def _bytes(path: Path) -> bytes:
         raise SrfError(f"{path}: {error.strerror}", "Name the bank, and the file of its truths.", exit_code=1) from error
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_seal(bank: Path) -> dict[str, Any]:
+    """Return what the seal of a bank says, its schema not checked; SrfError where there is none, or a damaged one."""
+    path = bank / SEAL
     try:
         data = parse_json(_bytes(path), path)
     except SrfError as error:

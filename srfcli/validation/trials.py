@@ -23,7 +23,7 @@ from srfcli.results.provenance import Provenance, write_result
 from srfcli.results.tables import Result, Table, to_csv, to_json, to_text
 from srfcli.validation import marks as marking
 from srfcli.validation.blind import Answer, Diagnose, Task, answer_case, diagnose_case, failed, read_answers, write_answers
-from srfcli.validation.cases import BANKS, SEAL, TRACKS, Truths, check_cases, check_kinds, make_bank, unseal
+from srfcli.validation.cases import BANKS, SEAL, TRACKS, Truths, check_cases, check_kinds, make_bank, read_seal, unseal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,36 +33,16 @@ SCHEMA = "srf.trial/1"
 CPU_LIMIT = 1800.0  # s of CPU a case may take: six times what it should
 
 
-@dataclass(frozen=True)
 class Trial:
-    """The folder of a trial, and what lies where in it."""
+    """The folder of a trial: in `bank` lie the cases and their seal, all that a diagnosis is given; the rest are files.
 
-    folder: Path
+    `apart` has the truths, `answers` the answers, one a line, `note` what was asked for, `opened` which answers there were when
+    the truths were unsealed.
+    """
 
-    @property
-    def bank(self) -> Path:
-        """Return the folder of the cases and their seal: all that a diagnosis is given."""
-        return self.folder / "bank"
-
-    @property
-    def apart(self) -> Path:
-        """Return the file of the truths."""
-        return self.folder / "truths.json"
-
-    @property
-    def answers(self) -> Path:
-        """Return the file of the answers, one a line."""
-        return self.folder / "answers.jsonl"
-
-    @property
-    def note(self) -> Path:
-        """Return the file that says what was asked for."""
-        return self.folder / "trial.json"
-
-    @property
-    def opened(self) -> Path:
-        """Return the file that says which answers there were when the truths were unsealed."""
-        return self.folder / "unsealed.json"
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.bank, self.apart = folder, folder / "bank", folder / "truths.json"
+        self.answers, self.note, self.opened = folder / "answers.jsonl", folder / "trial.json", folder / "unsealed.json"
 
     def asked(self) -> dict[str, Any]:
         """Return what was asked for: cases, seed, kinds, track and bank; SrfError where the folder is none of a trial."""
@@ -78,13 +58,12 @@ class Trial:
 
     def digest(self) -> str:
         """Return the digest of the truths, as it was published with the cases."""
-        return str(json.loads((self.bank / SEAL).read_text(encoding="utf-8"))["truths"])
+        return str(read_seal(self.bank)["truths"])
 
     def waiting(self) -> list[str]:
         """Return the cases that have no answer yet."""
         answered = read_answers(self.answers)
-        return [name for name in sorted(json.loads((self.bank / SEAL).read_text(encoding="utf-8"))["cases"])
-                if name not in answered]  # fmt: skip
+        return [name for name in sorted(read_seal(self.bank)["cases"]) if name not in answered]
 
 
 def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[str], track: str | None = None,
