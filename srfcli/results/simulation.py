@@ -32,9 +32,7 @@ if TYPE_CHECKING:
 MANY_BREAKS = 50  # a recorded load has knots, not changes
 OSCILLATION_SAMPLES = 20  # show no oscillation
 OTHERS = (  # what a record has beside the first observable, where it is asked for
-    Column("elongation", "um", "what another gauge shows"),
-    Column("force", "N", "what another gauge shows"),
-    Column("friction", "1", "what another gauge shows"),
+    *(Column(name, unit, "what another gauge shows") for name, unit in OBSERVABLES.items()),
     Column("slip", "um", "slip of the slider since the first sample"),
     Column("contact_area", "1", "contact area over that of contacts of 1 s"),
 )
@@ -45,8 +43,8 @@ STICK = 0.1  # of the driving velocity: a cycle whose slowest slip is below it s
 class Job:
     """One record to simulate: the parameters `p` (n_parameters,), what is imposed, and what is compared or written.
 
-    `run` is the recording that it repeats, None for a record of one's own; `ripple` the frequency of a modulation in Hz;
-    `tables` are those of the model, if it has any: the track.
+    `run` is the recording that it repeats, None for a record of one's own; `tables` are those of the model, if it has any: the
+    track.
     """
 
     name: str
@@ -56,7 +54,6 @@ class Job:
     t: Array
     start: Array | None
     observable: str
-    ripple: float | None = None
     modulation: Declared | None = None
     run: Run | None = None
     tables: tuple[Spline, ...] = ()
@@ -194,7 +191,6 @@ class SimulationResult(Result):
         model, jobs = self.work.model, self.work.jobs
         named = any(job.run is not None for job in jobs)
         gauge = any(r.measured is not None for r in self.records)
-        ages = [name for name in model.states if name.startswith("ln_") and name != "ln_v"]
         units, force = {job.shown(OBSERVABLES[job.observable]) for job in jobs}, jobs[0].shown("N")
         unit = units.pop() if len(units) == 1 else "um, N or 1"
         named_beside = {name for job in jobs for name in job.beside}
@@ -206,14 +202,14 @@ class SimulationResult(Result):
             Column("W", force, "imposed normal load; empty where it is unknown"),
             Column("u", "um", "elongation of the spring"),
             Column("v", "um/s", "slip velocity"),
-            *(Column(name[3:], "s", "age of the contacts") for name in ages),
+            *(Column(name[3:], "s", "age of the contacts") for name in _ages(model)),
             Column("mu", "1", "friction coefficient"),
             Column("tau", force, "friction force: mu times the load on the asperities; empty where it is unknown"),
             *([Column("recorded", unit, "what the run's file holds")] if named else []),
             *([Column("measured", unit, "the simulated observable through the gauge")] if gauge else []),
             *beside,
         )
-        blocks = [_block(r, self.work.model, ages, [c.name for c in beside], named=named, gauge=gauge) for r in self.records]
+        blocks = [_block(r, model, columns) for r in self.records]
         notes = (*self.work.notes, *(note for r in self.records for note in summary(r, named=named)))
         meta = {"samples": {r.job.name: r.done for r in self.records}, **self.work.meta}
         return Table("srf.simulate/1", columns, Rows(blocks), model.title, notes, self.work.parameters, meta, self.worst.value)
@@ -278,24 +274,24 @@ class Rows(Sequence[tuple[Any, ...]]):
         raise IndexError(index)
 
 
-def _block(
-    r: Record, model: GeneratedModel, ages: list[str], beside: list[str], *, named: bool, gauge: bool
-) -> tuple[tuple[Any, ...], Sequence[Array]]:
+def _ages(model: GeneratedModel) -> list[str]:
+    """Return the states that are logarithms of ages."""
+    return [name for name in model.states if name.startswith("ln_") and name != "ln_v"]
+
+
+def _block(r: Record, model: GeneratedModel, columns: Sequence[Column]) -> tuple[tuple[Any, ...], Sequence[Array]]:
     """Return the cells that lead each row of a record, and the columns that follow."""
-    n, trace = r.done, r.trace
-    with np.errstate(over="ignore"):
-        states = [np.exp(trace.state(name)) for name in ages]
-    W = trace.W if r.job.load_known else np.full(trace.t.size, np.nan)
+    trace, run, nothing = r.trace, r.job.run, np.full(r.trace.t.size, np.nan)
+    W = trace.W if r.job.load_known else nothing
     load = _along(model, r.job, trace, "load") if r.job.load_known else None
-    columns = [trace.t, trace.V, W, trace.u, trace.v, *states, trace.mu, (W if load is None else load) * trace.mu]
-    if named:
-        assert r.job.run is not None
-        columns.append(np.where(r.job.run.used, r.job.run.observed, np.nan))
-    if gauge:
-        columns.append(r.observed if r.measured is None else r.measured)
-    others = dict(zip(r.job.beside, r.others, strict=True))
-    columns += [others.get(name, np.full(trace.t.size, np.nan)) for name in beside]
-    return ((r.job.name,) if named else ()), [c[:n] for c in columns]
+    with np.errstate(over="ignore"):
+        cells = {name[3:]: np.exp(trace.state(name)) for name in _ages(model)}
+    cells |= {"t": trace.t, "V": trace.V, "W": W, "u": trace.u, "v": trace.v, "mu": trace.mu}
+    cells |= {"tau": (W if load is None else load) * trace.mu, "measured": r.observed if r.measured is None else r.measured}
+    cells |= {} if run is None else {"recorded": np.where(run.used, run.observed, np.nan)}
+    cells |= dict(zip(r.job.beside, r.others, strict=True))
+    lead = () if run is None else (run.name,)
+    return lead, [cells.get(c.name, nothing)[: r.done] for c in columns[len(lead) :]]
 
 
 def summary(r: Record, *, named: bool) -> list[str]:
@@ -322,7 +318,7 @@ def _oscillations(r: Record) -> list[str]:
     sentences, steady = [], 0
     for a, b, V in _stretches(r.job, trace.t[:n]):
         t, u, v = trace.t[a:b], trace.u[a:b], trace.v[a:b]
-        events = stick_slip(t, u, ripple=r.job.ripple)
+        events = stick_slip(t, u, ripple=r.job.modulation[0] if r.job.modulation else None)
         if not events.sustained:
             steady += 1
             continue

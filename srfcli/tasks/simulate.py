@@ -214,10 +214,7 @@ def record_of(
     p = model.vector({**values, **asked})
     model.check_changing_load(p)
     state = start_state(model, p, start, drive=drive, load=load.rest(begin), begin=begin)
-    job = Job(
-        "simulated", p, drive, load, t, state, observables[0], modulation and modulation[0], modulation,
-        beside=tuple(observables[1:]),
-    )  # fmt: skip
+    job = Job("simulated", p, drive, load, t, state, observables[0], modulation, beside=tuple(observables[1:]))
     work = Work(model, (job,), system.described(without=replaced))
     return work if on is None else on_field(work, *on, start=start)
 
@@ -481,9 +478,8 @@ def _job(model: GeneratedModel, experiment: Experiment, run: Run, values: Mappin
         state = start_state(model, p, start, drive=run.drive, load=run.first_load, begin=begin)
     except SrfError as error:
         raise SrfError(f"run {run.name!r}: {error.message}", error.hint) from error
-    ripple = run.modulation[0] if run.modulation else None
     beside = tuple(signal.observable for signal in run.others)
-    return Job(run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run, beside=beside)
+    return Job(run.name, p, run.drive, run.load, run.t, state, run.observable, run.modulation, run, beside=beside)
 
 
 def _described(model: GeneratedModel, experiment: Experiment, values: Mapping[str, float]) -> dict[str, dict[str, Any]]:
