@@ -303,7 +303,7 @@ def test_commands_that_are_shown_but_not_run_are_read() -> None:
 def test_the_list_of_commands_says_what_they_say() -> None:
     for name, (place, sentence) in COMMANDS.items():
         module, _, attribute = place.partition(":")
-        command = getattr(importlib.import_module(module), attribute)
+        command = getattr(importlib.import_module(f"srfcli.cli.{module}"), attribute)
         assert isinstance(command, click.Command)
         assert sentence == command.get_short_help_str(limit=1000), name
 
@@ -316,7 +316,7 @@ from srfcli.cli.main import COMMANDS, main
 try:
     main(["linear", "--help"])
 finally:
-    own = {{place.partition(":")[0] for place, _ in COMMANDS.values()}}
+    own = {{f"srfcli.cli.{{place.partition(':')[0]}}" for place, _ in COMMANDS.values()}}
     print(sorted(own & set(sys.modules)), file=sys.stderr)
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import errno
 import io
 import logging
 import os
@@ -220,9 +219,6 @@ def _ended(group: click.Group, arguments: list[str], session: Session, **extra: 
         return stop.code if isinstance(stop.code, int) else EXIT_UNEXPECTED
     except (KeyboardInterrupt, click.Abort) as error:
         return _end("interrupted", None, EXIT_INTERRUPTED, error, session)
-    except BrokenPipeError:
-        _silence_stdout()
-        return EXIT_UNEXPECTED
     except SrfError as error:
         caret = error.caret() if isinstance(error, ExpressionError) else None
         command = _named_command(group, arguments)[1]
@@ -233,12 +229,12 @@ def _ended(group: click.Group, arguments: list[str], session: Session, **extra: 
         told, hint = _usage_text(error, group, arguments)
         return _end(told, hint, error.exit_code, error, session)
     except OSError as error:
-        if error.errno == errno.EPIPE:
+        closed = isinstance(error, BrokenPipeError)
+        if closed or error.filename == STDOUT:
             _silence_stdout()
+        if closed:
             return EXIT_UNEXPECTED
         where = f"{error.filename}: " if error.filename else ""
-        if error.filename == STDOUT:
-            _silence_stdout()
         return _end(f"{where}{error.strerror or error}", None, EXIT_UNEXPECTED, error, session)
     except Exception as error:
         if isinstance(error, ArithmeticError) or type(error).__name__ == "LinAlgError":  # NumPy's, not imported for it

@@ -6,13 +6,12 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, EXIT_OK, EXIT_PARTIAL, Session, as_options
-from srfcli.cli.options import OutputOptions
+from srfcli.cli.options import Options, OutputOptions, add_options
 from srfcli.core.errors import SrfError, Status, printable
 from srfcli.core.files import check_target, write_atomic
 from srfcli.laws.values import Law
@@ -111,10 +110,6 @@ class Progress:
 
     Nothing is written where stderr is no terminal, and under -q. The estimate uses the share that is done: of `total`, or as
     given to `advance`. Without either the line shows the elapsed time.
-
-    with Progress("boundary", total=60) as progress:
-        for point in points:
-            progress.advance(note=f"V = {point.V:.3g} um/s")
     """
 
     def __init__(self, label: str, total: int | None = None, *, stream: Any = None, quiet: bool | None = None) -> None:
@@ -122,12 +117,17 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._raw = getattr(self._stream, "unescaped", self._stream)
         self._active = self._stream.isatty() and not (Session.current().quiet if quiet is None else quiet)
-        self._shown_at, self._begun = 0.0, time.monotonic()
+        self._shown_at, self._begun, self._entered = 0.0, time.monotonic(), time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Return how long the work has taken so far, all its stages together."""
+        return time.perf_counter() - self._entered
 
     def __enter__(self) -> Progress:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self._clear()
 
     def _clear(self) -> None:
@@ -184,17 +184,16 @@ def duration(seconds: float) -> str:
 
 # The way out of a command whose result is one text: stdout or --out FILE.
 
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def out_option(function: F) -> F:
-    """Add --out and --force; the command gets `out`, None for stdout, and `force`."""
-    function = click.option("--force", is_flag=True, help="Overwrite an existing file.")(function)
-    return click.option("--out", metavar="FILE", callback=_place, help="Write to FILE; - is stdout.")(function)
-
 
 def _place(context: click.Context, parameter: click.Parameter, value: str | None) -> Path | None:
     return None if value in (None, "-") else Path(str(value)).expanduser()
+
+
+OUT_OPTIONS: Options = {
+    "out": click.option("--out", metavar="FILE", callback=_place, help="Write to FILE; - is stdout."),
+    "force": click.option("--force", is_flag=True, help="Overwrite an existing file."),
+}
+out_option = add_options(OUT_OPTIONS)  # the command gets `out`, None for stdout, and `force`
 
 
 def put(text: str, out: Path | None, *, force: bool) -> None:

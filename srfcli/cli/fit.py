@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,13 +108,10 @@ def command(
         _fit_thresholds(source, system, output, **options)
         return
     _refuse(("bounds", "method", "tol", "max_evaluations"), "critical loads")
-    for name, setting in system.chosen.items():
-        if setting.origin == "flag":
-            raise SrfError(f"--{name} is given, and an experiment names its own", "Change [model] in experiment.toml.")
-    if system.effects:
-        raise SrfError("--effect is given, and an experiment names its own", "Change [model] in experiment.toml.")
-    if system.flags:
-        name = next(iter(system.flags))
+    laws = [name for name, setting in system.chosen.items() if setting.origin == "flag"]
+    for name in (*laws, *(["effect"] if system.effects else [])):
+        raise SrfError(f"--{name} is given, and an experiment names its own", "Change [model] in experiment.toml.")
+    for name in system.flags:
         raise SrfError(f"{name} is set, and an experiment has its own values", "Change it in experiment.toml.")
     if campaign:
         _fit_campaign(sources, place, spread, system, output, **options)
@@ -141,7 +137,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     experiment = read_experiment(source, format=options["reader"], registry=registry)
     free = listed(options["free"]) or None
     kept = _draws_file(options["draws"], options["sample"], output)
-    begun, done = time.perf_counter(), FitShare(options["starts"])
+    done = FitShare(options["starts"])
     with Progress("fit") as progress:
 
         def report(stage: str, text: str, share: float | None) -> None:
@@ -159,7 +155,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     emit(
         found.table, output, more=more, laws=found.found.problem.model.laws,
         inputs=[experiment.path, *experiment.files], seed=options["seed"],
-        timings={"fit": time.perf_counter() - begun}, figure=found.plot,
+        timings={"fit": progress.seconds}, figure=found.plot,
     )  # fmt: skip
     if found.posterior is not None and kept is not None:
         to_arviz(found.posterior).to_netcdf(str(kept))
@@ -180,7 +176,6 @@ def _fit_campaign(
             raise SrfError(f"--table {place} is no .csv file", f"End it in .csv: --table {target.with_suffix('.csv')}")
         check_target(target, force=output.force or spread.resume is not None, what="--table")
     free = listed(options["free"]) or None
-    begun = time.perf_counter()
     with Progress("fit", total=len(sources)) as progress:
 
         def done(so_far: CampaignResult) -> None:
@@ -193,7 +188,7 @@ def _fit_campaign(
             options={"free": free, "seed": options["seed"], **{k: options[k] for k in ("trend", "track", "starts")}},
         )  # fmt: skip
     emit(
-        found.table, output, seed=options["seed"], timings={"fit": time.perf_counter() - begun}, figure=found.plot,
+        found.table, output, seed=options["seed"], timings={"fit": progress.seconds}, figure=found.plot,
         inputs=[p for p in (s / "experiment.toml" if s.is_dir() else s for s in sources) if p.is_file()],
     )  # fmt: skip
     if target is not None and found.rows:

@@ -198,8 +198,31 @@ def _nearest(registry: Registry, name: str, kind: str | None) -> str:
 
 
 def _document(one: Law) -> dict[str, Any]:
-    own = _effect_document(one) if isinstance(one, Effect) else _law_document(one)
+    """Return all that a law's or an effect's file says as plain data."""
+    from srfcli.laws.effect_file import formula_text
+
     checks = [{"quantity": c.quantity, "at": dict(c.at), "value": c.value, "rtol": c.rtol} for c in one.checks]
+    if isinstance(one, Effect):
+        states = [
+            {"name": s.name, "rate": formula_text(s.rate), "steady": formula_text(s.steady), "logarithmic": s.logarithmic}
+            for s in one.states
+        ]
+        own = {
+            "changes": {slot: formula_text(formula) for slot, formula in one.written or one.changes},
+            "states": states,
+            "neutral": dict(one.neutral),
+            "constants": {c.name: {"value": c.default, "unit": c.unit, "about": c.about} for c in one.constants},
+            "settings": dict(one.settings),
+            "frees": list(one.frees),
+            "needs": list(one.needs),
+            "lacks": list(one.lacks),
+            "observed": one.observed or None,
+            "reported": one.reported,
+        }
+    else:
+        formula = formula_of(one)
+        states = [{"name": s.name, "length": s.length, "weight": s.weight} for s in getattr(one, "states", ())]
+        own = {FORMULA[kind_of(one)]: None if formula is None else str(formula), "states": states}
     found = {
         "name": one.name, "kind": kind_of(one), "about": one.about, **own,
         "parameters": {p.name: {key: getattr(p, key) for key in PARAMETER_KEYS} for p in one.parameters},
@@ -208,63 +231,28 @@ def _document(one: Law) -> dict[str, Any]:
     return plain_value(found)
 
 
-def _law_document(one: Law) -> dict[str, Any]:
-    formula = formula_of(one)
-    states = [{"name": s.name, "length": s.length, "weight": s.weight} for s in getattr(one, "states", ())]
-    return {FORMULA[kind_of(one)]: None if formula is None else str(formula), "states": states}
-
-
-def _effect_document(one: Effect) -> dict[str, Any]:
-    from srfcli.laws.effect_file import formula_text
-
-    states = [
-        {"name": s.name, "rate": formula_text(s.rate), "steady": formula_text(s.steady), "logarithmic": s.logarithmic}
-        for s in one.states
-    ]
-    return {
-        "changes": {slot: formula_text(formula) for slot, formula in one.written or one.changes},
-        "states": states,
-        "neutral": dict(one.neutral),
-        "constants": {c.name: {"value": c.default, "unit": c.unit, "about": c.about} for c in one.constants},
-        "settings": dict(one.settings),
-        "frees": list(one.frees),
-        "needs": list(one.needs),
-        "lacks": list(one.lacks),
-        "observed": one.observed or None,
-        "reported": one.reported,
-    }
-
-
 def _text(one: Law) -> str:
-    lines = [
-        f"{one.name}  ({kind_of(one)})",
-        one.about,
-        "",
-        *(_effect_lines(one) if isinstance(one, Effect) else _law_lines(one)),
-    ]
+    """Return the same for a reader."""
+    from srfcli.laws.effect_file import formula_text, summary
+
+    if isinstance(one, Effect):
+        own = summary(one).split("; ")
+        own += [f"{s.name} = {formula_text(s.steady)} in steady sliding" for s in one.states]
+        own += [f"{c.name} = {c.default:g} {c.unit}" + (f", {c.about}" if c.about else "") for c in one.constants]
+        own += [f"the baseline has {name} = {value:g}" for name, value in one.neutral]
+        own += [f"for laws with {', '.join(one.needs)}"] if one.needs else []
+        own += [f"for models without {', '.join(one.lacks)}"] if one.lacks else []
+        own += [f"reported as {one.reported}"] if one.reported != one.name else []
+    else:
+        formula = formula_of(one)
+        own = [f"{FORMULA[kind_of(one)]} = {'rigid' if formula is None else formula}"]
+        own += [f"state {s.name}: length {s.length}, weight {s.weight}" for s in getattr(one, "states", ())]
+    lines = [f"{one.name}  ({kind_of(one)})", one.about, "", *own]
     if one.parameters:
         lines += ["", *_parameter_lines(one)]
     if one.cites:
         lines += ["", *(f"[{number}] {cite}" for number, cite in enumerate(one.cites, 1))]
     return "\n".join([*lines, "", f"from {one.source}"])
-
-
-def _law_lines(one: Law) -> list[str]:
-    formula = formula_of(one)
-    lines = [f"{FORMULA[kind_of(one)]} = {'rigid' if formula is None else formula}"]
-    return lines + [f"state {s.name}: length {s.length}, weight {s.weight}" for s in getattr(one, "states", ())]
-
-
-def _effect_lines(one: Effect) -> list[str]:
-    from srfcli.laws.effect_file import formula_text, summary
-
-    lines = summary(one).split("; ")
-    lines += [f"{s.name} = {formula_text(s.steady)} in steady sliding" for s in one.states]
-    lines += [f"{c.name} = {c.default:g} {c.unit}" + (f", {c.about}" if c.about else "") for c in one.constants]
-    lines += [f"the baseline has {name} = {value:g}" for name, value in one.neutral]
-    lines += [f"for laws with {', '.join(one.needs)}"] if one.needs else []
-    lines += [f"for models without {', '.join(one.lacks)}"] if one.lacks else []
-    return lines + ([f"reported as {one.reported}"] if one.reported != one.name else [])
 
 
 def _parameter_lines(one: Law) -> list[str]:

@@ -15,62 +15,44 @@ import click
 from srfcli.cli.base import CONTEXT, SrfGroup, switches
 from srfcli.core import ONE_THREAD, __version__
 
-# command -> module:attribute and the first sentence of its help, in the order of `srf --help`, which imports none of them
+# command -> file:attribute in srfcli/cli and the first sentence of its help, in the order of `srf --help`, which imports none
 COMMANDS = {
-    "laws": ("srfcli.cli.law:laws", "List all registered laws, without importing them."),
-    "law": ("srfcli.cli.law:law", "Show, write and check laws."),
+    "laws": ("law:laws", "List all registered laws, without importing them."),
+    "law": ("law:law", "Show, write and check laws."),
     "derive": (
-        "srfcli.cli.system:derive",
+        "system:derive",
         "Steady state, slopes, equations, dispersion relation and closed critical loads of a system, by algebra.",
     ),
     "code": (
-        "srfcli.cli.system:code",
+        "system:code",
         "Print the generated NumPy module of a system: rates, Jacobians, derivatives by the parameters, "
         "characteristic polynomial.",
     ),
-    "linear": ("srfcli.cli.stability:linear", "Critical load, K/W0 and frequency of steady sliding under constant load."),
-    "critical": ("srfcli.cli.stability:critical", "Every critical load at the given velocities, numbered from low W0."),
-    "continue": (
-        "srfcli.cli.stability:continue_",
-        "The stability boundary of the forced sliding state in a plane of two parameters.",
-    ),
-    "floquet": (
-        "srfcli.cli.stability:floquet",
-        "The forced periodic state at one V, W0 and eps: multipliers, mean friction, harmonics.",
-    ),
-    "map": ("srfcli.cli.map:map_", "The stability of the forced sliding state over a plane of two parameters."),
-    "response": ("srfcli.cli.stability:response", "How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t)."),
+    "linear": ("stability:linear", "Critical load, K/W0 and frequency of steady sliding under constant load."),
+    "critical": ("stability:critical", "Every critical load at the given velocities, numbered from low W0."),
+    "continue": ("stability:continue_", "The stability boundary of the forced sliding state in a plane of two parameters."),
+    "floquet": ("stability:floquet", "The forced periodic state at one V, W0 and eps: multipliers, mean friction, harmonics."),
+    "map": ("map:map_", "The stability of the forced sliding state over a plane of two parameters."),
+    "response": ("stability:response", "How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t)."),
     "compare": (
-        "srfcli.cli.map:compare",
+        "map:compare",
         "Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment discriminates "
         "between them.",
     ),
-    "new": (
-        "srfcli.cli.recordings:new",
-        "Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take.",
-    ),
-    "check": (
-        "srfcli.cli.recordings:check",
-        "Read and validate an experiment and report sampling, defects and noise of its recordings.",
-    ),
+    "new": ("recordings:new", "Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take."),
+    "check": ("recordings:check", "Read and validate an experiment and report sampling, defects and noise of its recordings."),
     "fit": (
-        "srfcli.cli.fit:command",
+        "fit:command",
         "Fit the model of an experiment to its recordings and critical loads, all together, by maximum likelihood.",
     ),
     "diagnose": (
-        "srfcli.cli.diagnose:diagnose",
+        "diagnose:diagnose",
         "Find where recordings, or critical loads, differ from their model, and which physics the model lacks.",
     ),
-    "report": ("srfcli.cli.diagnose:report", "Write one page on the fits, maps, comparisons and other results of a folder."),
-    "simulate": (
-        "srfcli.cli.simulate:command",
-        "Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding.",
-    ),
-    "prove": (
-        "srfcli.cli.prove:command",
-        "Test the diagnosis on synthetic experiments whose truth is sealed until the last answer.",
-    ),
-    "config": ("srfcli.cli.system:config", "Show which values are used, and where each comes from."),
+    "report": ("diagnose:report", "Write one page on the fits, maps, comparisons and other results of a folder."),
+    "simulate": ("simulate:command", "Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding."),
+    "prove": ("prove:command", "Test the diagnosis on synthetic experiments whose truth is sealed until the last answer."),
+    "config": ("system:config", "Show which values are used, and where each comes from."),
 }
 
 EPILOG = """
@@ -89,13 +71,13 @@ Exit codes: 0 done, 1 unexpected or I/O, 2 wrong usage, or an invalid law, exper
 
 
 class Commands(UserDict[str, Any]):
-    """The commands by name; one that is still a place, module:attribute, is imported when it is asked for."""
+    """The commands by name; one that is still a place, file:attribute, is imported when it is asked for."""
 
     def __getitem__(self, name: str) -> click.Command:
         found = self.data[name]
         if isinstance(found, str):
             module, _, attribute = found.partition(":")
-            found = self.data[name] = getattr(importlib.import_module(module), attribute)
+            found = self.data[name] = getattr(importlib.import_module(f"srfcli.cli.{module}"), attribute)
         command: click.Command = found
         return command
 

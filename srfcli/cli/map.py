@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,9 +51,6 @@ srf map --eps 0.4 --workers 8 --resume parts --out map.csv
 @options.output_options
 def map_(
     system: options.SystemOptions,
-    eps: str | None,
-    V: str | None,
-    W0: str | None,
     over: tuple[options.Range, ...],
     boundary: str | None,
     boundaries: bool,
@@ -66,6 +62,7 @@ def map_(
     max_mesh: int,
     spread: options.Spread,
     output: options.OutputOptions,
+    **given: str | None,
 ) -> None:
     """The stability of the forced sliding state over a plane of two parameters.
 
@@ -82,19 +79,18 @@ def map_(
     if boundary is not None and not boundaries:
         raise SrfError("--boundary needs the boundaries that --no-boundaries leaves out", "Drop one of the two.")
     place = None if boundary is None else _boundary_output(boundary, output)
-    given = {"eps": eps, "V": V, "W0": W0}
     options.check_axes({name for r in over for name in r.name.split("/")}, given)
     slider = system.slider(**given)
     slider.model.check_changing_load(slider.vector())
     x, y = read_axes(slider.model, slider.vector(), over)
     settings = ContinuationSettings(tol=system.tolerance(tol).value, max_mesh=max_mesh, steps=StepSettings(largest=step))
     warn_uncompiled("a map takes about three times as long")
-    begun, mapped = time.perf_counter(), 0.0
+    mapped = 0.0
     with Progress("map") as progress:
 
         def tiles(done: int, count: int) -> None:
             nonlocal mapped
-            mapped = time.perf_counter() - begun
+            mapped = progress.seconds
             progress.total, progress.done = count, done
             progress.advance(0, note="tiles")
 
@@ -106,7 +102,7 @@ def map_(
             slider, x=x, y=y, grid=MapSettings(mesh_error=mesh_error, depth=depth), curves=settings,
             boundaries=boundaries, criticality=criticality, run=spread.run, tiles=tiles, progress=then,
         )  # fmt: skip
-    timings = {"map": mapped, "boundaries": time.perf_counter() - begun - mapped}
+    timings = {"map": mapped, "boundaries": progress.seconds - mapped}
     text, laws = output.format == "text" and found.followed, slider.model.laws
     more = (found.special_points,) if text and found.special_points.rows else ()
     emit(found.components if text else found.table, output, more=more, laws=laws, timings=timings, figure=found.plot)
@@ -171,12 +167,8 @@ def _load_axis(model: GeneratedModel, base: Array, x: MapAxis) -> MapAxis:
 
     if "W0" in (x.moved, x.held):
         raise SrfError(f"--over {x.name} alone spans no plane", "Add the other axis: --over V=1:100:80.")
-    corners = []
-    for value in x.samples()[:: max(1, (x.count - 1) // 4)]:
-        corner = base.copy()
-        corner[model.index(x.moved)] = x.parameter(model, base, value)
-        corners.append(corner)
-    window = found_window(model, corners)
+    values = x.parameter(model, base, x.samples()[:: max(1, (x.count - 1) // 4)])
+    window = found_window(model, [model.with_values(base, **{x.moved: value}) for value in values])
     lo, hi = window.lo, window.hi
     if "K" in (x.moved, x.held):
         return MapAxis("W0", lo, hi, ROWS)
@@ -233,7 +225,6 @@ def compare(
     """
     from srfcli.tasks import map as tasks
 
-    begun = time.perf_counter()
     sliders = _sliders(laws, ageings, system)
     window = _window(next(iter(sliders.values())).model, over)
     warn_uncompiled("boundaries take about three times as long")
@@ -243,7 +234,7 @@ def compare(
             **window, run=spread.run, progress=lambda name, share: progress.advance(note=name, share=share),
         )  # fmt: skip
     every = dict.fromkeys(law for slider in sliders.values() for law in slider.model.laws)
-    emit(found.table, output, laws=every, timings={"all": time.perf_counter() - begun}, figure=found.plot)
+    emit(found.table, output, laws=every, timings={"all": progress.seconds}, figure=found.plot)
     finish(found.status)
 
 

@@ -122,7 +122,11 @@ def parse_over(text: str) -> Range:
         raise SrfError(f"--over {text!r}: unknown spacing {spacing!r}", "Known: lin, log")
     if spacing == "log" and lo <= 0:
         raise SrfError(f"--over {text!r}: a logarithmic range cannot reach {lo:g}", "Begin above 0, or end it in :lin.")
-    return Range(name, lo=lo, hi=hi, n=_count(fields, text), spacing=spacing, unit=unit)
+    digits = fields[2] if len(fields) > 2 else str(DEFAULT_POINTS)
+    if not (digits.isascii() and digits.isdecimal() and len(digits) < 8 and 2 <= int(digits) <= MAX_POINTS):
+        hint = f"Write a whole number from 2 to {MAX_POINTS}, as in V=1:100:60."
+        raise SrfError(f"--over {text!r}: {digits!r} is not a number of points", hint)
+    return Range(name, lo=lo, hi=hi, n=int(digits), spacing=spacing, unit=unit)
 
 
 def _numbers(name: str, parts: Sequence[str], text: str) -> tuple[tuple[float, ...], str]:
@@ -139,23 +143,12 @@ def _numbers(name: str, parts: Sequence[str], text: str) -> tuple[tuple[float, .
     return tuple(number for number, _ in pairs), units[0] if units else ""
 
 
-def _count(fields: Sequence[str], text: str) -> int:
-    if len(fields) < 3:
-        return DEFAULT_POINTS
-    digits = fields[2]
-    if not (digits.isascii() and digits.isdecimal() and len(digits) < 8 and 2 <= int(digits) <= MAX_POINTS):
-        hint = f"Write a whole number from 2 to {MAX_POINTS}, as in V=1:100:60."
-        raise SrfError(f"--over {text!r}: {digits!r} is not a number of points", hint)
-    return int(digits)
-
-
 def parse_overs(texts: Sequence[str]) -> tuple[Range, ...]:
     """Return the ranges that several --over describe; raises SrfError if two are over the same parameter."""
     ranges = tuple(map(parse_over, texts))
-    for index, made in enumerate(ranges):
-        if made.name in {r.name for r in ranges[:index]}:
-            hint = "Give one range for each parameter, or list values: V=1,2,5."
-            raise SrfError(f"--over {made.name} is given twice", hint)
+    names = [made.name for made in ranges]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise SrfError(f"--over {twice[0]} is given twice", "Give one range for each parameter, or list values: V=1,2,5.")
     return ranges
 
 
@@ -199,9 +192,8 @@ def values_option(
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add --NAME for a list of values, `--V 1,7,25` or repeated, with or without unit.
 
-    The command gets `NAME`, a tuple of floats in the declared unit, checked against the bounds, or None if neither
-    the option nor a `default` was given. Text and unit of the help come from `parameter`. If `configured`, the help says that
-    the value of `srf config show` is taken in place of None.
+    The command gets `NAME`, a tuple of floats in the declared unit, checked against the bounds, or `default`. If `configured`,
+    the help says that the value of `srf config show` is taken in place of None.
     """
     unit = "" if parameter.unit == "1" else f", in {parameter.unit}"
     meaning = about or parameter.about or parameter.name
@@ -240,6 +232,7 @@ APPARATUS_FLAGS = {  # the flags that have their own option; every other paramet
     "angle": "Inclination of an inclined spring, in deg.",
 }
 PATH = click.Path(path_type=Path)
+POSITIVE = click.FloatRange(0, min_open=True)
 LOADINGS = ("vertical", "inclined")
 LAW_CHOICES = ("law", "ageing", "interface")
 CHOICES = (*LAW_CHOICES, "loading", "inertia")
@@ -376,6 +369,14 @@ SYSTEM_OPTIONS: Options = {
     ),
     "plugins": plugins_option,
 }
+EFFECTS_OPTION = click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    metavar="NAME",
+    help="Add this effect to the laws; `srf laws --kind effect` lists all; repeatable.",
+    shell_complete=names_of("effect"),
+)
 
 
 def add_options(options: Options) -> Callable[[F], F]:
@@ -389,27 +390,18 @@ def add_options(options: Options) -> Callable[[F], F]:
     return decorate
 
 
-def _as_one(function: F, name: str, read: Callable[..., Any], options: Options) -> F:
-    """Add options of which the command gets one argument, `name`: what `read` makes of their values."""
+def _as_one(name: str, read: Callable[..., Any], options: Options) -> Callable[[F], F]:
+    """Return a decorator that adds options of which the command gets one argument, `name`: what `read` makes of their values."""
 
-    @functools.wraps(function)
-    def wrapper(*args: Any, **kwargs: Any) -> Any:
-        taken = {key: kwargs.pop(key) for key in options}
-        return function(*args, **{name: read(**taken)}, **kwargs)
+    def decorate(function: F) -> F:
+        @functools.wraps(function)
+        def wrapper(*args: Any, **kwargs: Any) -> Any:
+            taken = {key: kwargs.pop(key) for key in options}
+            return function(*args, **{name: read(**taken)}, **kwargs)
 
-    return add_options(options)(wrapper)  # type: ignore[return-value]
+        return add_options(options)(wrapper)  # type: ignore[return-value]
 
-
-def system_options(function: F) -> F:
-    """Add the options that choose a system; the command gets them as `system`, a SystemOptions."""
-    return _as_one(function, "system", _read_system, SYSTEM_OPTIONS)
-
-
-def options_with_effects(function: F) -> F:
-    """Add what `system_options` adds, and --effect."""
-    text = "Add this effect to the laws; `srf laws --kind effect` lists all; repeatable."
-    effect = click.option("--effect", "effects", multiple=True, metavar="NAME", help=text, shell_complete=names_of("effect"))
-    return _as_one(function, "system", _read_system, {**SYSTEM_OPTIONS, "effects": effect})
+    return decorate
 
 
 def _read_system(
@@ -419,6 +411,11 @@ def _read_system(
     chosen = {key: choose(key, taken[key], toml=toml) for key in CHOICES}
     flags = read_flags(taken, assignments)
     return SystemOptions(chosen, flags=flags, plugins=plugins, toml=toml, effects=effects)
+
+
+# the command gets `system`, a SystemOptions
+system_options = _as_one("system", _read_system, SYSTEM_OPTIONS)
+options_with_effects = _as_one("system", _read_system, {**SYSTEM_OPTIONS, "effects": EFFECTS_OPTION})
 
 
 def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, str]:
@@ -443,10 +440,7 @@ def mesh_option(*, least: int, most: int = 8192, default: int = 512) -> Callable
     return click.option("--max-mesh", type=kind, default=default, help="Intervals of the finest mesh.")
 
 
-def step_option(function: F) -> F:
-    """Add --step, the longest step of a continuation; the command gets `step`."""
-    text = "Longest step along the curve, as a share of the window."
-    return click.option("--step", default=0.035, help=text)(function)
+step_option = click.option("--step", default=0.035, help="Longest step along the curve, as a share of the window.")
 
 
 def check_axes(swept: Container[str], given: Mapping[str, str | None]) -> None:
@@ -479,16 +473,6 @@ OUTPUT_OPTIONS: Options = {
 }
 
 
-def output_options(function: F) -> F:
-    """Add --json, --csv, --out, --plot, --force and --no-provenance; the command gets `output`, already checked."""
-    return _as_one(function, "output", read_output, OUTPUT_OPTIONS)
-
-
-def record_options(function: F) -> F:
-    """Add what `output_options` adds but --plot, for a command that has no figure."""
-    return _as_one(function, "output", read_output, {k: v for k, v in OUTPUT_OPTIONS.items() if k != "plot"})
-
-
 def read_output(
     *,
     as_json: bool = False,
@@ -519,6 +503,11 @@ def read_output(
     suffix = place.suffix.lower().lstrip(".") if place is not None else ""
     format = "json" if as_json else "csv" if as_csv else suffix if suffix in TABLE_FORMATS else "text"
     return OutputOptions(format, place, figure, force, provenance)
+
+
+# the command gets `output`, an OutputOptions; one without a figure has no --plot
+output_options = _as_one("output", read_output, OUTPUT_OPTIONS)
+record_options = _as_one("output", read_output, {k: v for k, v in OUTPUT_OPTIONS.items() if k != "plot"})
 
 
 # Options that spread a long computation: --workers, --cluster and --resume, the same path for all three.
@@ -559,16 +548,14 @@ WORKER_OPTIONS: Options = {
 }
 
 
-def worker_options(function: F) -> F:
-    """Add --workers, --cluster and --resume; the command gets them as `spread`, a Spread."""
-    return _as_one(function, "spread", _read_spread, WORKER_OPTIONS)
-
-
 def _read_spread(*, workers: int | None, cluster: str | None, resume: str | None) -> Spread:
     if workers is not None and cluster is not None:
         raise SrfError("--workers and --cluster exclude each other", "A cluster has its own number of workers.")
     count = workers if workers else os.cpu_count() or 1 if workers == 0 else 1
     return Spread(count, cluster, None if resume is None else Path(resume).expanduser())
+
+
+worker_options = _as_one("spread", _read_spread, WORKER_OPTIONS)  # the command gets `spread`, a Spread
 
 
 def listed(texts: Sequence[str]) -> list[str]:
@@ -587,6 +574,4 @@ def vary_options(function: F) -> F:
     return trend(vary(by(function)))
 
 
-def reader_option(function: F) -> F:
-    """Add --format, the reader of all data files; the command gets `reader`."""
-    return click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")(function)
+reader_option = click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")

@@ -9,7 +9,7 @@ import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
 from srfcli.cli.emit import Progress, emit
-from srfcli.cli.options import PATH, OutputOptions, plugins_option
+from srfcli.cli.options import PATH, POSITIVE, OutputOptions, plugins_option
 from srfcli.core.errors import SrfError
 
 EXAMPLES = """
@@ -51,13 +51,7 @@ TRACKS = ("smooth", "rough", "shared")
 @click.option("--resume", is_flag=True, help="Go on with the trial in --out.")
 @click.option("--report-only", metavar="DIR", type=PATH, help="Diagnose nothing; mark the answers in DIR again.")
 @click.option("--unfinished", is_flag=True, help="Give up the cases without an answer: the trial ends here.")
-@click.option(
-    "--limit",
-    type=click.FloatRange(0, min_open=True),
-    default=30.0,
-    metavar="MINUTES",
-    help="CPU time after which a case has failed.",
-)
+@click.option("--limit", type=POSITIVE, default=30.0, metavar="MINUTES", help="CPU time after which a case has failed.")
 @plugins_option
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, in full precision.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print the marks as CSV, one case a line.")

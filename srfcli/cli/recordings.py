@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import click
 
 from srfcli.cli.base import EXIT_CONDITION, EXIT_OK, Session, SrfCommand
 from srfcli.cli.emit import Progress, emit
-from srfcli.cli.options import PATH, OutputOptions, open_registry, output_options, plugins_option, reader_option
+from srfcli.cli.options import PATH, POSITIVE, OutputOptions, open_registry, output_options, plugins_option, reader_option
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import check_target, write_atomic
 
@@ -137,13 +136,7 @@ def _column(text: str) -> tuple[str, str]:
 @click.option(
     "--fail-on", multiple=True, metavar="KIND", help="Exit with 4 if there is a notice of this kind; `notice` is any of them."
 )
-@click.option(
-    "--limit",
-    type=click.FloatRange(0, min_open=True),
-    default=512.0,
-    metavar="MB",
-    help="Largest recording that is held in memory.",
-)
+@click.option("--limit", type=POSITIVE, default=512.0, metavar="MB", help="Largest recording that is held in memory.")
 @click.option(
     "--simulate/--no-simulate", default=True, help="Simulate each run to compute the Cramer-Rao bounds of alpha, lambda and n."
 )
@@ -170,7 +163,7 @@ def check(
     for kind in fail_on:
         if kind not in NOTICE_KINDS and kind != "notice":
             raise SrfError(f"--fail-on {kind}: no such kind of notice", did_you_mean(kind, (*NOTICE_KINDS, "notice")))
-    begun, registry = time.perf_counter(), open_registry(plugins)
+    registry = open_registry(plugins)
     read = read_experiment(experiment, registry=registry, format=format, limit=int(limit * 2**20))
     with Progress("check", total=len(read.named(runs))) as progress:
         found = tasks.check(
@@ -178,7 +171,7 @@ def check(
         )
     table, *more = found.pages if output.format == "text" else (found.table,)
     inputs = [read.path, *dict.fromkeys(one.run.file for one in found.runs)]
-    emit(table, output, more=more, figure=found.plot, inputs=inputs, timings={"check": time.perf_counter() - begun})
+    emit(table, output, more=more, figure=found.plot, inputs=inputs, timings={"check": progress.seconds})
     kinds = found.notice_kinds
     failed = bool(kinds) if "notice" in fail_on else bool(kinds & set(fail_on))
     return EXIT_CONDITION if failed else EXIT_OK

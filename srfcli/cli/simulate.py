@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,6 @@ from srfcli.motion import STEP_RISE
 from srfcli.results.provenance import Provenance, sidecar, sidecar_path
 
 if TYPE_CHECKING:
-    from srfcli.codegen.slider import SlidingSystem
     from srfcli.data.noise import FrictionField
     from srfcli.data.values import ModelChoice
     from srfcli.motion.imposed import Load
@@ -115,11 +113,13 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
     else:
         work = _runs_again(system, experiment, given, field, spread)
     if field is not None:
-        work = dataclasses.replace(work, parameters={**work.parameters, **_field_parameters(field, given)})
-    begun = time.perf_counter()
+        amplitude = {"value": field.amplitude, "unit": "1", "origin": "flag"}
+        length = {"value": field.length, "unit": "um", "origin": "default" if given["field_length"] is None else "flag"}
+        parameters = {**work.parameters, "field_amplitude": amplitude, "field_length": length}
+        work = dataclasses.replace(work, parameters=parameters)
     with Progress("simulate", total=len(work.jobs)) as progress:
         found = simulate_work(work, rtol=given["rtol"], progress=lambda name, done: progress.advance(int(done), note=name))
-    timings, table = {"simulate": time.perf_counter() - begun}, found.table
+    timings, table = {"simulate": progress.seconds}, found.table
     folder, seed = given["folder"], given["seed"]
     if folder is not None and output.out is None and output.format == "text":
         table = dataclasses.replace(table, columns=(), rows=())  # the records are in the folder
@@ -145,12 +145,7 @@ def _check(given: dict[str, Any], experiment: Path | None, output: OutputOptions
         if given[one] is not None and given[other] is not None:
             hint = f"Leave out {OWN_RECORD[one]} or {OWN_RECORD[other]}."
             raise SrfError(f"{OWN_RECORD[one]} and {OWN_RECORD[other]} exclude each other", hint)
-    _check_folder(given, experiment, output)
-
-
-def _check_folder(given: dict[str, Any], experiment: Path | None, output: OutputOptions) -> None:
-    folder = given["folder"]
-    if folder is None:
+    if (folder := given["folder"]) is None:
         for name, option, unset in (("start_values", "--start-values", "true"), ("free", "--free", None)):
             if given[name] != unset:
                 raise SrfError(f"{option} is about an experiment that is written", "Name its folder: --out-dir DIR.")
@@ -175,12 +170,8 @@ def _write(found: SimulationResult, folder: Path, seed: int, output: OutputOptio
         session.say(f"Note: {note}")
     made = Provenance(session.arguments, work.parameters, work.model.laws, work.inputs, seed, timings)
     place = folder / DESCRIPTION
-    files = write_experiment(
-        found.experiment,
-        folder,
-        force=output.force,
-        sidecar=(lambda content: sidecar(place, content, made)) if output.provenance else None,
-    )
+    beside = (lambda content: sidecar(place, content, made)) if output.provenance else None
+    files = write_experiment(found.experiment, folder, force=output.force, sidecar=beside)
     if output.provenance:
         session.detail(f"Wrote {sidecar_path(place)}")
     session.say(f"Wrote {folder} ({len(files) - 1} run{'s' if len(files) != 2 else ''})")
@@ -261,10 +252,13 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], field: Friction
     program = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
     system.say_defaults(slider.resolved, [name for name, text in program.items() if text is None])
     loaded = None if given["load"] is None else length
-    modulation = work.jobs[0].modulation
+    modulation, described = work.jobs[0].modulation, slider.described()
+    for name, text in program.items():
+        if text is not None:
+            described[name] = {"value": str(text), "unit": "s:um/s" if name == "V" else "s:N", "origin": "flag"}
     return dataclasses.replace(
         work,
-        parameters=_own_parameters(slider, program),
+        parameters=described,
         gauges=gauges,
         experiment=made,
         remarks=tuple(f"the experiment names the file {name}" for name in files),
@@ -306,15 +300,6 @@ def _sampling_notes(rates: Sequence[float], f: float | None, loaded: float | Non
     return tuple(notes)
 
 
-def _own_parameters(slider: SlidingSystem, program: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the parameters with their origin, but those in whose place a program stands."""
-    described = slider.described()
-    for name, text in program.items():
-        if text is not None:
-            described[name] = {"value": str(text), "unit": "s:um/s" if name == "V" else "s:N", "origin": "flag"}
-    return described
-
-
 def _laws(system: SystemOptions) -> ModelChoice:
     """Return the laws by name, a file by its whole path: one relative to here means nothing in an experiment's folder."""
     from srfcli.data.values import ModelChoice
@@ -346,24 +331,22 @@ def parse_pieces(text: str, unit: str, *, option: str, example: str) -> tuple[Pi
     parts = [part.strip() for part in text.split(",")]
     if not any(parts):
         raise SrfError(f"{option} is empty", f"Write {option} '{example}'.")
-    return tuple(_parse_piece(part, i + 1, unit, option, example) for i, part in enumerate(parts))
-
-
-def _parse_piece(part: str, number: int, unit: str, option: str, example: str) -> Piece:
-    where = f"{option}: piece {number}, {part!r},"
-    duration_text, _, values_text = part.partition(":")
-    ends = [end.strip() for end in values_text.split("->")]
-    if part.count(":") != 1 or not duration_text.strip() or not all(ends) or len(ends) > 2:
-        raise SrfError(
-            f"{where} is not DURATION:VALUE or DURATION:FROM->TO", f"Write pieces with commas between them: {option} '{example}'."
-        )
-    duration = parse_quantity(duration_text, "s", name=f"{option}: the duration of piece {number}")
-    if not 0 < duration <= LONGEST_TIME:
-        raise SrfError(f"{where} lasts {duration:g} s", f"Give each piece a duration above 0, up to {LONGEST_TIME:g} s.")
-    split = [split_quantity(end, name=f"{option}: the value of piece {number}", example=f"5 {unit}") for end in ends]
-    written = next((u for _, u in reversed(split) if u), unit)
-    values = [convert(v, u or written, unit, name=f"{option}: piece {number}") for v, u in split]
-    return duration, values[0], values[-1]
+    pieces = []
+    for number, part in enumerate(parts, 1):
+        where = f"{option}: piece {number}, {part!r},"
+        duration_text, _, values_text = part.partition(":")
+        ends = [end.strip() for end in values_text.split("->")]
+        if part.count(":") != 1 or not duration_text.strip() or not all(ends) or len(ends) > 2:
+            hint = f"Write pieces with commas between them: {option} '{example}'."
+            raise SrfError(f"{where} is not DURATION:VALUE or DURATION:FROM->TO", hint)
+        duration = parse_quantity(duration_text, "s", name=f"{option}: the duration of piece {number}")
+        if not 0 < duration <= LONGEST_TIME:
+            raise SrfError(f"{where} lasts {duration:g} s", f"Give each piece a duration above 0, up to {LONGEST_TIME:g} s.")
+        split = [split_quantity(end, name=f"{option}: the value of piece {number}", example=f"5 {unit}") for end in ends]
+        written = next((u for _, u in reversed(split) if u), unit)
+        values = [convert(v, u or written, unit, name=f"{option}: piece {number}") for v, u in split]
+        pieces.append((duration, values[0], values[-1]))
+    return tuple(pieces)
 
 
 def parse_rates(text: str, pieces: int) -> tuple[float, ...]:
@@ -405,12 +388,3 @@ def read_field(given: Mapping[str, Any]) -> FrictionField | None:
     length = parse_quantity(given["field_length"] or str(FIELD_LENGTH), "um", name="--field-length")
     field = FrictionField(size, length, given["seed"])
     return field if field.amplitude else None
-
-
-def _field_parameters(field: FrictionField, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the field's amplitude and correlation length as described parameters."""
-    origin = "default" if given["field_length"] is None else "flag"
-    return {
-        "field_amplitude": {"value": field.amplitude, "unit": "1", "origin": "flag"},
-        "field_length": {"value": field.length, "unit": "um", "origin": origin},
-    }

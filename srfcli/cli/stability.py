@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import click
@@ -88,24 +87,19 @@ def critical(
     from srfcli.tasks import stability
 
     slider = system.slider()
-    limits = None if window is None else _window(window).fitted(slider.model.parameters, where=slider.model.title)
-    begun = time.perf_counter()
+    limits = None
+    if window is not None:
+        ends = options.parse_ends("W0", window)
+        if ends is None or not ends.lo > 0:
+            raise SrfError(f"--window {window!r} is not LOW:HIGH, two rising loads above 0", "Write --window 4:500.")
+        limits = ends.fitted(slider.model.parameters, where=slider.model.title)
     with Progress("critical", total=len(V or (None,)) * len(eps or (None,))) as progress:
         found = stability.critical(
             slider, V=V, eps=eps, window=None if limits is None else (limits.lo, limits.hi), **search,
             progress=lambda place: progress.advance(note=place),
         )  # fmt: skip
-    timings = {"solve": time.perf_counter() - begun}
-    emit(found.table, output, laws=slider.model.laws, timings=timings, figure=found.plot)
+    emit(found.table, output, laws=slider.model.laws, timings={"solve": progress.seconds}, figure=found.plot)
     finish(found.status)
-
-
-def _window(text: str) -> options.Range:
-    """Return the loads that LOW:HIGH spans, with or without a unit; raises SrfError that shows the form."""
-    found = options.parse_ends("W0", text)
-    if found is None or not found.lo > 0:
-        raise SrfError(f"--window {text!r} is not LOW:HIGH, two rising loads above 0", "Write --window 4:500.")
-    return found
 
 
 # `srf response`: how sliding follows a modulated load.
@@ -157,10 +151,10 @@ def response(
     swept = over[0].fitted(slider.model.parameters, where=slider.model.title)
     options.check_axes({swept.name}, {"V": V, "W0": W0})
     system.say_defaults(slider.resolved, {"V", "W0"} - {swept.name})
-    tolerance, begun = system.tolerance(tol).value, time.perf_counter()
-    found = stability.response(slider, over={swept.name: swept.points()}, eps=eps or None, tol=tolerance)
-    timings = {"solve": time.perf_counter() - begun}
-    emit(found.table, output, laws=slider.model.laws, timings=timings, figure=found.plot)
+    tolerance = system.tolerance(tol).value
+    with Progress("response") as progress:
+        found = stability.response(slider, over={swept.name: swept.points()}, eps=eps or None, tol=tolerance)
+    emit(found.table, output, laws=slider.model.laws, timings={"solve": progress.seconds}, figure=found.plot)
     finish(found.status)
 
 
@@ -202,10 +196,10 @@ def floquet(
 
     slider = system.slider(V=V, W0=W0, eps=eps)
     system.say_defaults(slider.resolved, ("V", "W0", "eps"))
-    tolerance, begun = system.tolerance(tol).value, time.perf_counter()
-    found = stability.floquet(slider, tol=tolerance, **settings)
-    timings = {"solve": time.perf_counter() - begun}
-    emit(found.table, output, laws=slider.model.laws, timings=timings, figure=found.plot)
+    tolerance = system.tolerance(tol).value
+    with Progress("floquet") as progress:
+        found = stability.floquet(slider, tol=tolerance, **settings)
+    emit(found.table, output, laws=slider.model.laws, timings={"solve": progress.seconds}, figure=found.plot)
     if not found.status.ok:
         finish(found.status)
     return EXIT_CONDITION if fail_on == ("stable" if found.stable else "unstable") else EXIT_OK
@@ -281,8 +275,6 @@ def continue_(
         )  # fmt: skip
         warn_uncompiled("boundaries take about three times as long")
         system.say_defaults(slider.resolved, {"V", "W0"} - spanned)
-        begun = time.perf_counter()
         *_, found = growing
-    timings = {"solve": time.perf_counter() - begun}
-    emit(found.table, output, laws=model.laws, timings=timings, figure=found.plot)
+    emit(found.table, output, laws=model.laws, timings={"solve": progress.seconds}, figure=found.plot)
     finish(found.status)

@@ -60,11 +60,7 @@ def show(system: SystemOptions, output: OutputOptions) -> None:
     for p in built.parameters:
         rows.append((p.name, resolved.declared[p.name], p.unit, resolved.origins[p.name], p.about or None))
     notes = (f"settings file: {system.toml.path}",) if system.toml.path else ()
-    emit(
-        Table("srf.config/1", COLUMNS, rows, title=built.title, notes=notes, parameters=resolved.described()),
-        output,
-        laws=built.laws,
-    )
+    emit(Table("srf.config/1", COLUMNS, rows, built.title, notes, resolved.described()), output, laws=built.laws)
 
 
 # `srf derive`: what follows from a law by algebra, and the paper's equations held against it.
