@@ -84,14 +84,12 @@ class CheckResult(Result):
     runs: tuple[RunCheck, ...] = field(repr=False)
     forecast: Forecast | None = field(default=None, repr=False)
 
-    @property
-    def _told(self) -> Sequence[CramerRaoBound | None]:
-        return [None] * len(self.runs) if self.forecast is None else self.forecast.runs
-
     @cached_property
     def table(self) -> Table:
         """Return a row for each run; notes are the notices and what the loads can tell, in sentences."""
         experiment, forecast = self.experiment, self.forecast
+        bounds: Sequence[CramerRaoBound | None] = [None] * len(self.runs) if forecast is None else forecast.runs
+        found = list(zip(self.runs, bounds, strict=True))
         notes = [
             *map(str, experiment.notices),
             *(f"{check.run.name}: {notice}" for check in self.runs for notice in check.run.notices),
@@ -104,7 +102,7 @@ class CheckResult(Result):
             "experiment": str(experiment.path),
             "model": dataclasses.asdict(experiment.choice),
             "notices": list(map(dataclasses.asdict, experiment.notices)),
-            "runs": [described(check, one) for check, one in zip(self.runs, self._told, strict=True)],
+            "runs": [described(check, bound) for check, bound in found],
             "together": together and tells(together),
         }
         parameters = {}
@@ -114,7 +112,7 @@ class CheckResult(Result):
             origin = "fixed" if p.fixed else f"start, {low:g} to {high:g}"
             parameters[p.name] = {"value": value, "unit": unit, "origin": origin}
         title = experiment.title or experiment.path.parent.name
-        rows = [row(check, one) for check, one in zip(self.runs, self._told, strict=True)]
+        rows = [row(check, bound) for check, bound in found]
         columns = tuple(dataclasses.replace(c, unit=shown_unit(c.unit, stress=experiment.stress)) for c in COLUMNS)
         return Table("srf.check/3", columns, rows, title, tuple(notes), parameters, meta)
 

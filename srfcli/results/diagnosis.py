@@ -170,7 +170,7 @@ class DiagnosisResult(Result):
         keys = ("name", "baseline", "baseline_stderr", "augmented", "augmented_stderr", "unit", "shift_sigma")
         rows = [tuple(r[k] for k in keys) for r in self._parameters]
         notes = []
-        if _differ(self.answer):
+        if self.answer["baseline"] != self.answer["augmented"]:
             notes.append("the baseline is fitted with the augmented model's field and gauge noise, to show what it lacks")
         notes += self._alternatives
         return Table("srf.diagnose.parameters/1", PARAMETERS, rows, "parameters", tuple(notes))
@@ -240,11 +240,6 @@ class DiagnosisResult(Result):
         """Return the run that the verdict rests on most: recording, both models, residuals, random friction, what was imposed.
 
         Without runs it is the first table of critical loads, under both models.
-
-        Raises
-        ------
-        SrfError
-            Where Matplotlib is not installed, or an axes that stands in no grid is given.
         """
         return plots.in_place(ax, self._panels)
 
@@ -351,7 +346,7 @@ def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:
         rest = "" if held is None else f", {held:.4g} in those held out"
         field = side["field"]
         track = "needs no random friction" if field is None else f"needs random friction of {field['amplitude']:.2g}"
-        like = "with the augmented model's field and gauge noise, " if name == "baseline" and _differ(found) else ""
+        like = "with the augmented model's field and gauge noise, " if name == "baseline" and side != found["augmented"] else ""
         told = f"rms over noise {side['fit']['rms_over_noise']:.4g} in"
         if recorded:
             notes.append(f"{name}: {track}; {like}{told} the runs fitted{rest}")
@@ -364,10 +359,6 @@ def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:
     for effect, size in found.get("detectable", {}).items():
         notes.append(f"{effect} could have been seen from a size of {size:.3g} on")
     return notes
-
-
-def _differ(found: dict[str, Any]) -> bool:
-    return bool(found["baseline"] != found["augmented"])
 
 
 def _missing(missing: dict[str, Any]) -> list[str]:

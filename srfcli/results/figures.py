@@ -75,8 +75,7 @@ def recordings(checks: Sequence[RunCheck], *, title: str = "") -> Figure:
             axes = stacked(figure, outer[k // columns, k % columns], (3, 1, 1) if check.run.load_known else (3, 1), hspace=0.06)
             _panel(axes, check)
             figure.align_ylabels(axes)
-        if title:
-            plots.heading(figure, plots.name_text(title, wide=True))
+        plots.heading(figure, plots.name_text(title, wide=True))
         settle(figure)
         return figure
 

@@ -16,7 +16,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
 from srfcli.data.thresholds import Thresholds
-from srfcli.data.values import BETWEEN_SAMPLES, Experiment, told_of_runs
+from srfcli.data.values import BETWEEN_SAMPLES, Experiment, Run, told_of_runs
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.fit import Fit, RunFit
 from srfcli.inference.noise import lag_one
@@ -152,25 +152,22 @@ class FitResult(Result):
         return unit, [None if x is None else from_base(x, declared) * factor for x in values]
 
     @property
-    def _observables(self) -> list[RunFit]:
-        """Return how each observable is fitted, run by run."""
-        fit = self.found.fit
-        return [f for first in fit.runs for f in (first, *(g for g in fit.others if g.name == first.name))]
+    def _observables(self) -> list[tuple[RunFit, Run, str]]:
+        """Return how each observable is fitted, run by run, with its run and its name."""
+        fit, runs = self.found.fit, {run.name: run for run in self.experiment.runs}
+        fitted = [f for first in fit.runs for f in (first, *(g for g in fit.others if g.name == first.name))]
+        return [(f, runs[f.name], f.observable or runs[f.name].observable) for f in fitted]
 
     @cached_property
     def runs(self) -> Table | None:
         """Return a row for each run, fitted or held out: residual, noise, and what is left of them; None without runs."""
-        rows, runs = [], {run.name: run for run in self.experiment.runs}
-        for f in self._observables:
-            observable = f.observable or runs[f.name].observable
-            size = sum(b - a for a, b in f.parts)
-            ratio = f.rms / f.white if f.white else None
-            unit = runs[f.name].unit_of(observable)
-            rows.append(
-                (f.name, observable, "held out" if f.holdout else "fit", size, f.rms, f.white, unit, ratio,
-                 lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
-            )  # fmt: skip
-        return Table("srf.fit.runs/1", RUNS, rows, "runs") if runs else None
+        rows = [
+            (f.name, observable, "held out" if f.holdout else "fit", sum(b - a for a, b in f.parts), f.rms, f.white,
+             run.unit_of(observable), f.rms / f.white if f.white else None, lag_one(f.residual, f.parts),
+             len(f.colours) or f.noise.order)
+            for f, run, observable in self._observables
+        ]  # fmt: skip
+        return Table("srf.fit.runs/1", RUNS, rows, "runs") if self.experiment.runs else None
 
     @cached_property
     def tables(self) -> Table | None:
@@ -298,17 +295,16 @@ class FitResult(Result):
 
     def _colours(self) -> list[str]:
         """Return what coloured gauge noise was found, of which observable and in which runs unless in all."""
-        fitted, runs = [f for f in self._observables if not f.holdout], {run.name: run for run in self.experiment.runs}
+        fitted = [each for each in self._observables if not each[0].holdout]
         kinds: dict[tuple[tuple[float, ...], str, str], list[str]] = {}
-        for f in fitted:
-            observable = f.observable or runs[f.name].observable
-            unit = runs[f.name].unit_of(observable)
+        for f, run, observable in fitted:
+            unit = run.unit_of(observable)
             for colour in f.colours:
                 kinds.setdefault((colour, observable, "" if unit == "1" else unit), []).append(f.name)
-        several, notes = len({f.observable for f in fitted}) > 1, []
+        several, notes = len({f.observable for f, _, _ in fitted}) > 1, []
         for (colour, observable, unit), names in kinds.items():
             of = f" of {observable}" if several else ""
-            of += f" in {', '.join(names)}" if len(set(names)) < len({f.name for f in fitted}) else ""
+            of += f" in {', '.join(names)}" if len(set(names)) < len({f.name for f, _, _ in fitted}) else ""
             comma = "," if len(colour) == 3 else ""
             notes.append(f"gauge noise{of}: {colour_text(colour, unit)}{comma} besides white noise, or physics that is missing")
         return notes
@@ -368,10 +364,8 @@ class FitResult(Result):
         """Return which standard errors are too small by the intervals; without any, whether those of critical loads may be."""
         found, fit = self.found, self.found.fit
         if self.intervals:
-            place = [fit.names.index(i.name) for i in self.intervals]
-            bounds = [(float(fit.lower[k]), float(fit.upper[k])) for k in place]
-            names = [i.name for i in self.intervals]
-            told = farther(self.intervals, [fit.values[n] for n in names], [fit.stderr[n] for n in names], bounds)
+            bounds = list(zip(fit.lower, fit.upper, strict=True))
+            told = farther(self.intervals, [fit.values[n] for n in fit.names], list(fit.stderr.values()), bounds)
             return said_likelier(self.intervals, self._shown) + told
         if not (found.problem.tables and found.state_space and found.status.ok):
             return []
@@ -382,7 +376,7 @@ class FitResult(Result):
         return plots.in_place(ax, self._panels)
 
     def _panels(self) -> Figure:
-        fit, runs = self.found.fit, {run.name: run for run in self.experiment.runs}
+        fit = self.found.fit
         count = len(self._observables) + len(fit.tables)
         columns = min(count, 2)
         lines = math.ceil(count / columns)
@@ -391,9 +385,9 @@ class FitResult(Result):
             grid = figure.add_gridspec(lines, columns)
             cells = [grid[place // columns, place % columns] for place in range(count)]
             handles: list[Any] = []
-            for cell, one in zip(cells, self._observables, strict=False):
-                run, what, noise = runs[one.name], one.observable or runs[one.name].observable, one.white
-                unit, recorded = run.unit_of(what), next(s for s in run.signals if s.observable == what).observed
+            for cell, (one, run, what) in zip(cells, self._observables, strict=False):
+                unit, noise = run.unit_of(what), one.white
+                recorded = next(s for s in run.signals if s.observable == what).observed
                 above, below = stacked(figure, cell, (2, 1), hspace=0.05)
                 dots = above.plot(run.t, recorded, ".", color="#999999", markersize=3.0, label="recorded", rasterized=True)
                 line = above.plot(run.t, one.y, color=plots.COLOURS[0], linewidth=0.9, label="model")
@@ -446,12 +440,12 @@ def said_not_quadratic(names: Sequence[str]) -> list[str]:
 def farther(
     intervals: Sequence[Interval], values: Sequence[float], errors: Sequence[float], bounds: Sequence[tuple[float, float]]
 ) -> list[str]:
-    """Return a sentence where intervals reach FARTHER than standard errors say; all of the parameters in the intervals' order."""
+    """Return a sentence where intervals, of the first parameters or all, reach FARTHER than standard errors say."""
     told = []
-    for interval, value, error, (lower, upper) in zip(intervals, values, errors, bounds, strict=True):
+    for interval, value, error, (lower, upper) in zip(intervals, values, errors, bounds, strict=False):
+        if not (np.isfinite(error) and error > 0):
+            continue
         for way, end, bound in (("down", interval.low, lower), ("up", interval.high, upper)):
-            if not (np.isfinite(error) and error > 0):
-                continue
             if end is None and abs(bound - value) > 1.96 * error:
                 told.append(f"{interval.name} without end {way}")
             elif end is not None and abs(end - value) > FARTHER * 1.96 * error:
@@ -496,15 +490,13 @@ def posterior_notes(posterior: Posterior) -> list[str]:
     worth, worst = float(posterior.effective.min()), float(posterior.r_hat.max())
     count, chains = posterior.draws.shape[0], posterior.chains.shape[1]
     made = f"posterior: {count} draws of {chains} chains after {posterior.burn_in} steps of burn-in"
-    interrupted = ["posterior: interrupted; the draws so far are kept"] if posterior.interrupted else []
-    if not (math.isfinite(worth) and math.isfinite(worst)):
-        return [f"{made}, too few steps to tell what they are worth", *interrupted]
-    notes = [
-        f"{made}, worth {worth:.0f} independent ones or more; R-hat up to {worst:.3f}; "
-        f"{posterior.accepted:.0%} of the proposals taken",
-        *interrupted,
-    ]
-    if not (worth >= ENOUGH and worst <= MIXED):
+    known = math.isfinite(worth) and math.isfinite(worst)
+    quality = (
+        f"worth {worth:.0f} independent ones or more; R-hat up to {worst:.3f}; {posterior.accepted:.0%} of the proposals taken"
+    )
+    notes = [f"{made}, {quality if known else 'too few steps to tell what they are worth'}"]
+    notes += ["posterior: interrupted; the draws so far are kept"] if posterior.interrupted else []
+    if known and not (worth >= ENOUGH and worst <= MIXED):
         more = max(math.ceil(1.2 * count * ENOUGH / max(worth, 1.0) / 100) * 100, 2 * count if worst > MIXED else 0)
         notes.append(
             f"posterior: intervals should rest on {ENOUGH:.0f} independent draws with R-hat up to {MIXED}: --sample {more}"
@@ -748,15 +740,15 @@ class CampaignResult(Result):
     @property
     def table(self) -> Table:
         """Return a row for each experiment; a parameter that an experiment does not fit is empty in its row."""
-        names = list(dict.fromkeys(name for row in self.rows for name in row.get("parameters", {}) if name != "K"))
+        fitted = dict.fromkeys(name for row in self.rows for name in row.get("parameters", {}))
+        names = [name for name in fitted if name != "K"]
         columns = [*LEADING]
         for name in names:
             units = dict.fromkeys(row["parameters"][name][2] for row in self.rows if name in row.get("parameters", {}))
             unit = next(iter(units)) if len(units) == 1 else ""
             columns += [Column(name, unit, "estimate"), Column(f"{name}_stderr", unit, "standard error", ".3g")]
         both = {"A", "B"} <= set(names)
-        fitted = {name for row in self.rows for name in row.get("parameters", {})}
-        covariances = [Column(name, "", "covariance") for name, pair in PAIRS.items() if {*pair} <= fitted]
+        covariances = [Column(name, "", "covariance") for name, pair in PAIRS.items() if {*pair} <= fitted.keys()]
         columns += [*(DERIVED if both else ()), *(c for c in STATED if c.name not in names), *covariances, *TRAILING]
         cells = []
         for row in self.rows:

@@ -23,7 +23,7 @@ from srfcli.numerics.plane import MapAxis
 from srfcli.numerics.special_points import SpecialPoint, crossings_at
 from srfcli.results import plots
 from srfcli.results.stability import boundary_columns, boundary_row
-from srfcli.results.tables import STATUS, Column, Result, Table, load_xarray
+from srfcli.results.tables import STATUS, Column, Result, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -215,23 +215,13 @@ class MapResult(Result):
         return Table("srf.map.boundary/1", columns, rows, **{**self._common, "notes": ()})
 
     def to_xarray(self) -> Any:
-        """Return growth and type of stability over the grid as an xarray.Dataset of two dimensions, named as the axes.
-
-        Raises
-        ------
-        SrfError
-            Where xarray is not installed.
-        """
-        xarray, grid, table = load_xarray(), self.found.grid, self.table
+        """Return growth and type of stability over the grid as an xarray.Dataset of two dimensions, named as the axes."""
+        grid, table = self.found.grid, self.table
         cells = zip(*table.rows, strict=True)
         fields = {c.name: np.array(v).reshape(grid.x.count, grid.y.count) for c, v in zip(table.columns, cells, strict=True)}
         x, y = column_name(grid.x), column_name(grid.y)
         coords = {x: fields.pop(x)[:, 0], y: fields.pop(y)[0]}
-        made = xarray.Dataset({name: ((x, y), values) for name, values in fields.items()}, coords=coords)
-        for column in table.columns:
-            made[column.name].attrs = {"units": column.unit, "long_name": column.about}
-        made.attrs = {"title": table.title, "status": table.status}
-        return made
+        return table.dataset({name: ((x, y), values) for name, values in fields.items()}, coords=coords)
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the map: growth as colour, boundaries as lines, special points as marks.

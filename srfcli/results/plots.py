@@ -85,25 +85,17 @@ def _missing() -> SrfError:
     return SrfError("a figure needs matplotlib, which is not installed", 'pip install "srfcli[plot]"')
 
 
-def load_matplotlib() -> None:
-    """Import matplotlib from another folder than the current one, whose `matplotlibrc` it would read and which is not trusted."""
-    if "matplotlib" in sys.modules:
-        return
-    try:
-        with contextlib.ExitStack() as stack:
-            with contextlib.suppress(OSError):  # a current folder that is gone holds no settings either
-                stack.enter_context(contextlib.chdir(Path(__file__).parent))
-            import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise _missing() from error
-
-
 @contextlib.contextmanager
 def house_style() -> Iterator[None]:
     """Draw and save with the house's settings, whatever the user's matplotlibrc says."""
-    load_matplotlib()
-    import matplotlib
-
+    try:
+        with contextlib.ExitStack() as stack:
+            if "matplotlib" not in sys.modules:  # it reads a `matplotlibrc` in the current folder, which is not trusted
+                with contextlib.suppress(OSError):  # a current folder that is gone holds no settings either
+                    stack.enter_context(contextlib.chdir(Path(__file__).parent))
+            import matplotlib
+    except ImportError as error:
+        raise _missing() from error
     logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # cache chatter is not the user's concern
     with matplotlib.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)  # a name in a script that the font lacks
@@ -340,18 +332,18 @@ def _shade_stable(ax: Axes, curves: Sequence[tuple[Values, Values]], colour: str
     low, high = ax.get_xlim()
     bottom, top = ax.get_ylim()
     columns = np.geomspace(low, high, 1200)
+    place = np.log(columns)
     edges: list[list[float]] = [[] for _ in columns]
-    covered = np.zeros(columns.size, bool)
     for x, y in curves:
-        xs, ys = np.log(np.asarray(list(x), float)), np.asarray(_gaps(y))
-        for i in range(len(xs) - 1):
-            if not (np.isfinite(ys[i]) and np.isfinite(ys[i + 1])) or xs[i] == xs[i + 1]:
+        points = zip(np.log(np.asarray(list(x), float)), _gaps(y), strict=True)
+        for (x0, y0), (x1, y1) in itertools.pairwise(points):
+            if not math.isfinite(y0 + y1) or x0 == x1:
                 continue
-            inside = np.nonzero((np.log(columns) - xs[i]) * (np.log(columns) - xs[i + 1]) <= 0)[0]
-            share = (np.log(columns[inside]) - xs[i]) / (xs[i + 1] - xs[i])
-            covered[inside] = True
-            for column, height in zip(inside.tolist(), ys[i] + share * (ys[i + 1] - ys[i]), strict=True):
-                edges[column].append(float(height))
+            inside = np.flatnonzero((place - x0) * (place - x1) <= 0)
+            heights = y0 + (place[inside] - x0) / (x1 - x0) * (y1 - y0)
+            for column, height in zip(inside.tolist(), heights.tolist(), strict=True):
+                edges[column].append(height)
+    covered = np.array([bool(heights) for heights in edges])
     most = max((len(e) for e in edges), default=0)
     levels = np.full((most + 2, columns.size), bottom)
     levels[0] = top
@@ -405,8 +397,8 @@ def orbit(tau: Values, *, u: Values, v: Values, states: Mapping[str, Values], mu
     with house_style():
         figure, axes = new_figure(len(panels), size=(6.0, 1.15 * len(panels) + 0.9))
         for ax, (label, values, log, quantity) in zip(axes, panels, strict=True):
-            ax.plot(_gaps(tau), _gaps(values), color=QUANTITY[quantity])
-            positive = [y for y in _gaps(values) if y > 0]
+            ax.plot(list(tau), list(values), color=QUANTITY[quantity])
+            positive = [y for y in values if y > 0]
             if log and positive and max(positive) > 3 * min(positive):
                 ax.set_yscale("log")
             else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import html
 import importlib.util
 import json
@@ -458,20 +459,15 @@ def tag(name: str, /, *children: Any, **attributes: Any) -> Markup:
 
 
 def table(
-    columns: Sequence[str],
-    rows: Sequence[Sequence[Any]],
-    *,
-    caption: str = "",
-    numeric: Sequence[int] = (),
-    chosen: Sequence[int] = (),
+    heads: Sequence[str], rows: Sequence[list[Any]], *, caption: str = "", numeric: Sequence[int] = (), chosen: Sequence[int] = ()
 ) -> Markup:
     """Return a table whose first column names the rows; `numeric` columns are set flush right, `chosen` rows stand out."""
     side = {i: "n" for i in numeric}
-    head = tag("thead", tag("tr", [tag("th", c, scope="col", class_=side.get(i)) for i, c in enumerate(columns)]))
+    head = tag("thead", tag("tr", [tag("th", c, scope="col", class_=side.get(i)) for i, c in enumerate(heads)]))
     body = []
     for k, row in enumerate(rows):
         cells = [tag("th", row[0], scope="row", class_=side.get(0))]
-        cells += [tag("td", cell, class_=side.get(i), data_label=columns[i]) for i, cell in enumerate(row[1:], 1)]
+        cells += [tag("td", cell, class_=side.get(i), data_label=heads[i]) for i, cell in enumerate(row[1:], 1)]
         body.append(tag("tr", cells, class_="chosen" if k in chosen else None))
     parts = [tag("caption", caption)] if caption else []
     return tag("div", tag("table", parts, head, tag("tbody", body)), class_="wide")
@@ -526,24 +522,15 @@ def page(title: str, *body: Any) -> str:
 PAGE = "report.html"
 FIGURES = "figures"
 
-Drawing = tuple[str, Callable[..., "Figure | None"]]
-
 
 def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str, Any]) -> tuple[Path, ...]:
     """Write report.html and figures/*.svg, *.png into `folder`, each whole or not at all, and return their places.
 
-    `answer` is the object of the format srf.diagnose/1. `material` is that of `srfcli.diagnosis.answer.material`:
-    title; about {effect: a phrase}; stated {stiffness, ageing}; laws: other ageing laws that were fitted;
-    runs: {name, holdout, label, load_unit, t, observed, used, baseline, augmented, V, W, windows} with arrays (n,), t in s, V in
-    um/s, and of baseline and augmented model: white, rms, friction;
-    thresholds: {name, holdout, table, baseline, augmented, chi2 (of both models)}, critical loads (n,) in N;
-    residual_scan: {axis, run, kind, low, high, log_p, p_value};
-    ranked: {name, evidence, rms_over_noise, field, confidence, against, told (whether it is what the verdict says)};
-    scores: {effect, gain, size, stderr, tolerance, detectable};
-    parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma};
+    `answer` is the object of the format srf.diagnose/1. `material` is that of `srfcli.diagnosis.answer.material`, in units of the
+    recordings, its runs with label and load_unit, and besides:
+    stated {stiffness, ageing}; laws: other ageing laws that were fitted; own {effect: its parameters};
     and, where there are any, alternatives: each model of an ambiguous verdict, with its parameters, as text; discriminating:
-    paragraphs on that run; force {run: {t, force, band (2, n), v, phi, W}, "form": text}; diagram {V, note, and for baseline and
-    augmented model: W0, V of these, W0_hopf}.
+    paragraphs on that run; force {run: {t, force, band (2, n), v, phi, W}, "form": text}; diagram, as `diagram_figure` takes it.
     Without matplotlib the page has all but the figures, and says so.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -566,7 +553,7 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     return (*written, folder / PAGE)
 
 
-def _drawings(matter: Matter) -> Iterator[Drawing]:
+def _drawings(matter: Matter) -> Iterator[tuple[str, Callable[..., Figure | None]]]:
     """Yield the name of each figure and what draws it."""
     if matter.traces:
         yield "overview", partial(report_figures.overview, matter.traces)
@@ -607,7 +594,7 @@ def _page(matter: Matter) -> str:
     if not matter.pictures:
         head.append(tag("p", 'The figures need matplotlib, which is not installed: pip install "srfcli[plot]"'))
     text = json.dumps(matter.answer, indent=2, ensure_ascii=False, allow_nan=False)
-    whole = tag("details", tag("summary", "The answer as data"), tag("pre", tag("code", text)))
+    whole = tag("details", tag("summary", "The answer as data"), commands([text]))
     foot = tag("p", f"srf {__version__}", class_="of")
     body = [tag("header", head, tag("nav", links)), tag("main", shown), whole, foot]
     return page(f"{title}: {verdict}", *body)
@@ -763,12 +750,9 @@ def _made(path: Path, data: Mapping[str, Any]) -> Markup:
             unit = unit_text(p.get("unit"))
             rows.append([f"{name} [{unit}]" if unit else name, _cell(p.get("value")), p.get("origin", "")])
         parts.append(table(["parameter", "value", "set by"], rows, numeric=(1,)))
-    try:
-        sidecar = json.loads(sidecar_path(path).read_text(encoding="utf-8"))
-        arguments = sidecar.get("arguments")
+    with contextlib.suppress(OSError, ValueError):
+        arguments = json.loads(sidecar_path(path).read_text(encoding="utf-8")).get("arguments")
         if isinstance(arguments, list):
-            parts.append(tag("pre", tag("code", "srf " + " ".join(map(str, arguments)))))
-    except (OSError, ValueError):
-        pass
+            parts.append(commands(["srf " + " ".join(map(str, arguments))]))
     parts.append(tag("p", tag("a", path.name, href=path.name)))
     return tag("details", tag("summary", "How it was made"), parts)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from srfcli.diagnosis.residual_scan import SIGNIFICANT
 from srfcli.results.figures import draw_loads, envelope, imposed_scale, settle
-from srfcli.results.plots import DOTTED, _gaps, bare_figure, curve_style, decade_ticks, house_style, name_text, new_figure
+from srfcli.results.plots import DOTTED, bare_figure, curve_style, decade_ticks, house_style, name_text, new_figure
 from srfcli.results.report_text import finite, number, with_unit
 
 if TYPE_CHECKING:
@@ -108,16 +108,11 @@ def trace(run: Mapping[str, Any]) -> Trace:
     )  # fmt: skip
 
 
-def rms_over_noise(z: Array) -> float:
-    """Return the root mean square of a residual that is in units of the noise; NaN of none."""
-    return float(np.sqrt(np.mean(z**2))) if z.size else float("nan")
-
-
 def local_rms(t: Array, z: Array) -> tuple[Array, Array]:
     """Return the borders (k + 1,) of pieces of a run in s and the rms (k,) of the residual in each."""
     pieces = np.array_split(np.arange(t.size), max(min(PIECES, t.size // PIECE_SAMPLES), 1))
-    borders = [t[p[0]] for p in pieces if p.size] + [t[-1]]
-    return np.asarray(borders), np.asarray([rms_over_noise(z[p]) for p in pieces if p.size])
+    borders = [t[p[0]] for p in pieces] + [t[-1]]
+    return np.asarray(borders), np.asarray([np.sqrt(np.mean(z[p] ** 2)) for p in pieces])
 
 
 def overview(traces: Sequence[Trace], *, narrow: bool = False) -> Figure:
@@ -326,8 +321,7 @@ def _near(axes: Sequence[Axes], one: Trace, part: slice) -> None:
     _models(axes[0], one, part)
     axes[0].set_title("close-up")
     axes[0].margins(x=0.02)
-    shown = ((one.after, AFTER, "o"),) if one.same else ((one.before, BEFORE, "o"), (one.after, AFTER, "x"))
-    for z, colour, marker in shown:
+    for (z, colour, _), marker in zip(one.sides(one.before, one.after), "ox", strict=False):
         axes[1].plot(one.t[part], z[part], color=colour, linewidth=0.7, alpha=0.8)
         if one.t[part].size <= DOTS // 3:
             axes[1].plot(one.t[part], z[part], marker, color=colour, markersize=2.4, linestyle="none")
@@ -645,24 +639,31 @@ def loads_figure(one: Mapping[str, Any], *, narrow: bool = False) -> Figure:
 
 
 def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figure | None:
-    """Return the stability boundary W0 (N) against V (um/s) of baseline and augmented model; keys V, W0_baseline, W0_augmented.
+    """Return the stability boundary W0 (N) against V (um/s) of both models, W0_baseline and W0_augmented; None without any.
 
-    `V_augmented` where the second has velocities of its own, `W0_hopf` under constant load, None or NaN for gaps.
+    They are over V, or velocities of their own, V_baseline and V_augmented; W0_hopf_... is under constant load; NaN is a gap.
     """
+
+    def values(key: str) -> Array:
+        return np.asarray(diagram.get(key, ()), dtype=float)
+
+    def alike(quantity: str) -> bool:
+        a, b = values(f"{quantity}_baseline"), values(f"{quantity}_augmented")
+        return a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True)
+
     curves = [("W0_baseline", "baseline", BEFORE, "-"), ("W0_augmented", "augmented model", AFTER, (0, (5, 1.5)))]
     curves += [("W0_hopf_baseline", "baseline, constant load", BEFORE, DOTTED)]
     curves += [("W0_hopf_augmented", "augmented model, constant load", AFTER, DOTTED)]
-    if all(_equal(diagram, key) for key in ("V", "W0", "W0_hopf")):  # nothing was added: one curve would hide the other
+    if all(map(alike, ("V", "W0", "W0_hopf"))):  # nothing was added: one curve would hide the other
         curves = [(key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]]
-    drawn = [c for c in curves if diagram.get(c[0]) is not None and np.isfinite(_gaps(diagram[c[0]])).any()]
-    if not drawn or diagram.get("V") is None:
+    drawn = [c for c in curves if np.isfinite(values(c[0])).any()]
+    if not drawn:
         return None
     with house_style():
         figure, (axis,) = new_figure(size=(NARROW_FIGURE, 4.6) if narrow else (6.4, 4.2))
         for key, label, colour, dash in drawn:
-            own = diagram.get(key.replace("W0", "V"))
-            V = diagram["V"] if own is None else own
-            axis.plot(_gaps(V), _gaps(diagram[key]), color=colour, linestyle=dash, label=label)
+            own = values(key.replace("W0", "V"))
+            axis.plot(own if own.size else values("V"), values(key), color=colour, linestyle=dash, label=label)
         axis.set_xscale("log")
         marks = [(float(V), float(W)) for V, W in diagram.get("marks") or () if V > 0 and W > 0]
         if marks:
@@ -671,7 +672,7 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
                 label="your runs", zorder=5, clip_on=False,
             )  # fmt: skip
         axis.margins(x=0.0 if not marks else 0.02)
-        heights = np.concatenate([*(_gaps(diagram[c[0]]) for c in drawn), [W for _, W in marks]])
+        heights = np.concatenate([*(values(c[0]) for c in drawn), [W for _, W in marks]])
         if np.nanmax(heights) > WIDE_QUANTITY * np.nanmin(heights) > 0:
             axis.set_yscale("log")
         axis.set_xlabel("V  [µm/s]")
@@ -681,14 +682,3 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
         decade_ticks(axis)
         settle(figure)
         return figure
-
-
-def _equal(diagram: Mapping[str, Any], quantity: str) -> bool:
-    """Return whether the augmented model's curve is the baseline's."""
-    baseline, augmented = (diagram.get(f"{quantity}_baseline", diagram.get(quantity)), diagram.get(f"{quantity}_augmented"))
-    if augmented is None:
-        return quantity == "V" or baseline is None
-    if baseline is None:
-        return False
-    a, b = (np.asarray(_gaps(values)) for values in (baseline, augmented))
-    return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True))

@@ -37,6 +37,13 @@ if TYPE_CHECKING:
 # What follows by algebra, the paper's equations held against it, and the module that computes with it.
 
 
+def _derivation() -> Any:
+    """Return the module that writes formulas, imported when it is asked for: sympy comes with it."""
+    from srfcli.symbolic import derivation
+
+    return derivation
+
+
 @dataclass(frozen=True, repr=False, eq=False)
 class DerivationResult(TextResult):
     """What follows from a system's laws by algebra, in the letters and normalisation of the paper.
@@ -55,9 +62,7 @@ class DerivationResult(TextResult):
     @cached_property
     def sections(self) -> tuple[Section, ...]:
         """Return the parts of the derivation, each with its named formulas and notes."""
-        from srfcli.symbolic.derivation import derivation
-
-        return derivation(self.system, self.extras)
+        return _derivation().derivation(self.system, self.extras)
 
     @property
     def formulas(self) -> dict[str, sp.Expr]:
@@ -76,37 +81,27 @@ class DerivationResult(TextResult):
     @property
     def text(self) -> str:
         """Return the formulas as plain text, one a line."""
-        from srfcli.symbolic.derivation import to_text
-
-        return to_text(self.system, self.sections, unicode=False)
+        return _derivation().to_text(self.system, self.sections, unicode=False)
 
     @property
     def pretty(self) -> str:
         """Return the formulas over several lines in Unicode."""
-        from srfcli.symbolic.derivation import to_text
-
-        return to_text(self.system, self.sections, unicode=True)
+        return _derivation().to_text(self.system, self.sections, unicode=True)
 
     @property
     def latex(self) -> str:
         """Return a LaTeX document, which needs amsmath."""
-        from srfcli.symbolic.derivation import to_latex
-
-        return to_latex(self.system, self.sections)
+        return _derivation().to_latex(self.system, self.sections)
 
     @property
     def python(self) -> str:
         """Return a NumPy function of the coefficients of the dispersion relation, in um, s, N."""
-        from srfcli.symbolic.derivation import to_python
-
-        return to_python(self.system)
+        return _derivation().to_python(self.system)
 
     @property
     def document(self) -> dict[str, Any]:
         """Return the formulas as plain data, which `srf derive --format json` prints."""
-        from srfcli.symbolic.derivation import to_document
-
-        return to_document(self.system, self.sections)
+        return _derivation().to_document(self.system, self.sections)
 
     def _repr_html_(self) -> str:
         """Return the formulas for a notebook, which sets what stands between dollar signs."""
@@ -142,16 +137,12 @@ class PaperResult(TextResult):
     @property
     def text(self) -> str:
         """Return the findings as text: equations, claims and words."""
-        from srfcli.symbolic.derivation import paper_text
-
-        return paper_text(self.findings)
+        return _derivation().paper_text(self.findings)
 
     @property
     def document(self) -> dict[str, Any]:
         """Return the findings as plain data, which `srf derive --check-paper --format json` prints."""
-        from srfcli.symbolic.derivation import paper_document
-
-        return paper_document(self.findings)
+        return _derivation().paper_document(self.findings)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -648,10 +639,6 @@ class BoundaryResult(Result):
                 plots.decade_ticks(ax)
                 return figure
         velocities = np.geomspace(plane.x.lo, plane.x.hi, 80)
-        hopf = []
-        for velocity in velocities:
-            p = plane.base.copy()
-            p[model.index("V")] = velocity
-            point = critical_point(model, p)[0]
-            hopf.append(None if point is None else float(p[model.index("K")]) / point.W0)
+        points = [critical_point(model, model.with_values(plane.base, V=velocity))[0] for velocity in velocities]
+        hopf = [None if point is None else float(plane.base[model.index("K")]) / point.W0 for point in points]
         return plots.stability_diagram(branches, hopf={"V": velocities, "K_over_W0": hopf}, title=title, ax=ax)

@@ -74,13 +74,7 @@ class Table:
         return [dict(zip(names, row, strict=True)) for row in self.rows]
 
     def to_dataframe(self) -> Any:
-        """Return the table as a pandas.DataFrame; `attrs` holds units, title, notes and status.
-
-        Raises
-        ------
-        SrfError
-            Where pandas is not installed.
-        """
+        """Return the table as a pandas.DataFrame; `attrs` has units, title, notes and status. Raises SrfError without pandas."""
         try:
             import pandas
         except ImportError as error:
@@ -96,15 +90,17 @@ class Table:
         return frame
 
     def to_xarray(self) -> Any:
-        """Return the table as an xarray.Dataset over its rows; every variable has its unit and meaning in `attrs`.
+        """Return the table as an xarray.Dataset over its rows; raises SrfError where xarray or pandas is not installed."""
+        frame = self.to_dataframe()
+        return self.dataset({name: ("row", frame[name].to_numpy()) for name in frame.columns})
 
-        Raises
-        ------
-        SrfError
-            Where xarray or pandas is not installed.
-        """
-        xarray, frame = load_xarray(), self.to_dataframe()
-        made = xarray.Dataset({name: ("row", frame[name].to_numpy()) for name in frame.columns})
+    def dataset(self, fields: Mapping[str, Any], **coordinates: Any) -> Any:
+        """Return an xarray.Dataset of these fields, each with its column's unit and meaning; raises SrfError without xarray."""
+        try:
+            import xarray
+        except ImportError as error:
+            raise SrfError("to_xarray needs xarray, which is not installed", 'pip install "srfcli[frames]"') from error
+        made = xarray.Dataset(fields, **coordinates)
         for column in self.columns:
             made[column.name].attrs = {"units": column.unit, "long_name": column.about}
         made.attrs = {"title": self.title, "status": self.status}
@@ -173,10 +169,7 @@ def cell_text(value: Any, format: str | None = None) -> str:
     if isinstance(simple, float) and not format:
         return repr(float(f"{simple:.12g}"))
     if isinstance(simple, float):
-        try:
-            return f"{simple:{Column.format if abs(simple) >= FIXED and str(format).endswith('f') else format}}"
-        except ValueError:  # a format for something else than a number
-            return repr(simple)
+        return f"{simple:{Column.format if abs(simple) >= FIXED and str(format).endswith('f') else format}}"
     return printable(" ".join(str(simple).split()))
 
 
@@ -335,22 +328,13 @@ class Result(ABC):
         return titled(self.table.title, self.table.parameters)
 
     def to_dataframe(self) -> Any:
-        """Return the table as a pandas.DataFrame; `attrs` holds units, title, notes and status.
-
-        Raises
-        ------
-        SrfError
-            Where pandas is not installed.
-        """
+        """Return the table as a pandas.DataFrame; `attrs` has units, title, notes and status. Raises SrfError without pandas."""
         return self.table.to_dataframe()
 
     def to_xarray(self) -> Any:
         """Return the table as an xarray.Dataset over its rows; every variable has its unit and meaning in `attrs`.
 
-        Raises
-        ------
-        SrfError
-            Where xarray or pandas is not installed.
+        Raises SrfError where xarray or pandas is not installed.
         """
         return self.table.to_xarray()
 
@@ -376,13 +360,7 @@ class TextResult(Result):
         """Return the text, as the command prints it."""
 
     def write(self, path: Path | str, *, force: bool = False) -> None:
-        """Write the text to a file, whole or not at all.
-
-        Raises
-        ------
-        SrfError
-            For a file that exists, unless `force`, or that cannot be written.
-        """
+        """Write the text to a file, whole or not at all; raises SrfError for one that exists, unless `force`."""
         check_target(Path(path), force=force, what="")
         write_atomic(Path(path), self.text)
 
@@ -392,12 +370,3 @@ class TextResult(Result):
 
     def __str__(self) -> str:
         return self.text.rstrip("\n")
-
-
-def load_xarray() -> Any:
-    """Return the module xarray; raises SrfError where it is not installed."""
-    try:
-        import xarray
-    except ImportError as error:
-        raise SrfError("to_xarray needs xarray, which is not installed", 'pip install "srfcli[frames]"') from error
-    return xarray
