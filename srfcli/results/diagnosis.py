@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +24,7 @@ from srfcli.diagnosis.search import Fitted
 from srfcli.diagnosis.verdict import Diagnosis, added, at_bounds
 from srfcli.laws.registry import Registry
 from srfcli.results import plots
+from srfcli.results.markup import tag
 from srfcli.results.provenance import Provenance, write_result
 from srfcli.results.report_figures import loads_figure, run_figure, trace
 from srfcli.results.report_text import unit_text
@@ -162,7 +162,7 @@ class DiagnosisResult(Result):
 
     def _repr_html_(self) -> str:
         """Return the verdict and the table for a notebook."""
-        return f"<p>{escape(self.sentence)}</p>{super()._repr_html_()}"
+        return tag("p", self.sentence) + super()._repr_html_()
 
     @property
     def parameter_table(self) -> Table:

@@ -14,13 +14,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from srfcli.core import __version__
 from srfcli.core.errors import SrfError
 from srfcli.core.files import unused_name, write_atomic
 from srfcli.results import report_figures
+from srfcli.results.markup import Markup, tag
 from srfcli.results.plots import figure_bytes
 from srfcli.results.provenance import sidecar_path
 from srfcli.results.report_text import (
@@ -420,42 +421,13 @@ def command_lines(answer: Mapping[str, Any], system: str) -> list[str]:
     return found + ([f"srf linear {system}", f"srf continue {system} --eps 0.18 --plot diagram.svg"] if system else [])
 
 
-# HTML by small functions: all text is escaped unless it was built here; one page with its style and its pictures inside.
+# Parts of a page: tables, pictures, sections; the page has its style and its pictures inside.
 
-VOID = frozenset({"br", "hr", "img", "meta", "source"})
 SMALL_SCREENS = "(max-width: 640px)"  # screens on which tables are read row by row, and figures are drawn narrow
 MIME = {".svg": "image/svg+xml", ".png": "image/png"}
 
 # No script, and nothing may be fetched, whatever a title or a name in a recording says.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-
-
-@final
-class Markup(str):
-    """Text that is HTML already; any other text is escaped where it is put in."""
-
-    __slots__ = ()
-
-
-def text(value: Any) -> Markup:
-    """Return `value` as HTML: markup as it is, a list as its parts one after the other, all else escaped."""
-    if isinstance(value, Markup):
-        return value
-    if isinstance(value, list | tuple):
-        return Markup("".join(text(v) for v in value))
-    return Markup(html.escape(str(value), quote=True))
-
-
-def tag(name: str, /, *children: Any, **attributes: Any) -> Markup:
-    """Return an element; `class_` stands for class, an attribute that is None is left out."""
-    written = "".join(
-        f' {key.rstrip("_").replace("_", "-")}="{html.escape(str(value), quote=True)}"'
-        for key, value in attributes.items()
-        if value is not None
-    )
-    if name in VOID:
-        return Markup(f"<{name}{written}>")
-    return Markup(f"<{name}{written}>{text(list(children))}</{name}>")
 
 
 def table(

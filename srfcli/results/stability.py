@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import html
 import itertools
 import math
 from collections.abc import Mapping
@@ -18,6 +17,7 @@ from srfcli.core.errors import Status, worst
 from srfcli.numerics.hopf import critical_point
 from srfcli.results import plots
 from srfcli.results.figures import gains
+from srfcli.results.markup import tag
 from srfcli.results.tables import STATUS, Column, Result, Table, TextResult
 
 if TYPE_CHECKING:
@@ -105,12 +105,12 @@ class DerivationResult(TextResult):
 
     def _repr_html_(self) -> str:
         """Return the formulas for a notebook, which sets what stands between dollar signs."""
-        parts = [f"<b>{html.escape(self.system.title)}</b>"]
+        parts = [tag("b", self.system.title)]
         for section in self.document["sections"]:
-            parts.append(f"<h4>{html.escape(section['title'])}</h4>")
-            parts += [f"<p>${html.escape(f['latex_name'])} = {html.escape(f['latex'])}$</p>" for f in section["formulas"]]
-            parts += [f"<p>{html.escape(note)}</p>" for note in section["notes"]]
-        return f"<div>{''.join(parts)}</div>"
+            parts.append(tag("h4", section["title"]))
+            parts += [tag("p", f"${f['latex_name']} = {f['latex']}$") for f in section["formulas"]]
+            parts += [tag("p", note) for note in section["notes"]]
+        return tag("div", parts)
 
 
 @dataclass(frozen=True, repr=False, eq=False)

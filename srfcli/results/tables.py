@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import html
 import io
 import json
 import math
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from srfcli.core import __version__
 from srfcli.core.errors import SrfError, Status, printable
 from srfcli.core.files import check_target, write_atomic
+from srfcli.results.markup import tag
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -111,25 +111,17 @@ class Table:
 
     def _repr_html_(self) -> str:
         """Return the table as HTML for a notebook, its first rows and its notes; all text is escaped."""
-        right = [is_numeric(self, i) for i in range(len(self.columns))]
-
-        def cell(tag: str, index: int, text: str, about: str = "") -> str:
-            side = "right" if right[index] else "left"
-            tip = f' title="{html.escape(about)}"' if about else ""
-            return f'<{tag} style="text-align:{side}"{tip}>{html.escape(text)}</{tag}>'
-
-        head = "".join(cell("th", i, c.heading, c.about) for i, c in enumerate(self.columns))
+        sides = [f"text-align:{'right' if is_numeric(self, i) else 'left'}" for i in range(len(self.columns))]
+        styled = list(zip(self.columns, sides, strict=True))
+        head = [tag("th", c.heading, style=side, title=c.about or None) for c, side in styled]
         body = [
-            "<tr>" + "".join(cell("td", i, cell_text(v, self.columns[i].format)) for i, v in enumerate(row)) + "</tr>"
-            for row in list(self.rows[:ROWS_SHOWN])
+            tag("tr", [tag("td", cell_text(v, c.format), style=side) for v, (c, side) in zip(row, styled, strict=True)])
+            for row in self.rows[:ROWS_SHOWN]
         ]
         left = len(self.rows) - len(body)
         notes = [*([f"{left} more rows"] if left else []), *self.notes]
-        told = "".join(f"<li>{html.escape(note)}</li>" for note in notes)
-        return (
-            f"<div><b>{html.escape(self.title)}</b><table><thead><tr>{head}</tr></thead>"
-            f"<tbody>{''.join(body)}</tbody></table>{f'<ul>{told}</ul>' if told else ''}</div>"
-        )
+        shown = tag("table", tag("thead", tag("tr", head)), tag("tbody", body))
+        return tag("div", tag("b", self.title), shown, tag("ul", [tag("li", note) for note in notes]) if notes else "")
 
 
 def plain_value(value: Any) -> Any:
