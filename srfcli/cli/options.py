@@ -221,6 +221,8 @@ def parse_values(texts: Sequence[str], parameter: Parameter) -> tuple[float, ...
     return tuple(found)
 
 
+Values = tuple[float, ...] | None  # of a `values_option`
+
 # Option decorators that commands share: which system, and where its results go.
 
 F = TypeVar("F", bound=Callable[..., Any])

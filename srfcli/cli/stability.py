@@ -9,6 +9,7 @@ import click
 from srfcli.cli import options
 from srfcli.cli.base import EXIT_CONDITION, EXIT_OK, SrfCommand
 from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
+from srfcli.cli.options import OutputOptions, Range, SystemOptions, Values
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
 
@@ -30,9 +31,7 @@ srf linear --loading inclined --ageing dieterich+linker-dieterich --over angle=-
     "--all-roots", is_flag=True, help="List every Hopf point, also where stability returns or other roots are unstable."
 )
 @options.output_options
-def linear(
-    system: options.SystemOptions, over: tuple[options.Range, ...], all_roots: bool, output: options.OutputOptions
-) -> None:
+def linear(system: SystemOptions, over: tuple[Range, ...], all_roots: bool, output: OutputOptions) -> None:
     """Critical load, K/W0 and frequency of steady sliding under constant load.
 
     From the exact characteristic polynomial: all its Hopf points, with the direction of crossing checked and the first
@@ -71,14 +70,7 @@ VELOCITY = Parameter("V", 10.0, "um/s", 1e-12, 1e9, "driving velocities")
 @click.option("--resolution", default=1e-3, help="Finest spacing in ln W0 where a pair of crossings could hide.")
 @options.mesh_option(least=32)
 @options.output_options
-def critical(
-    system: options.SystemOptions,
-    V: tuple[float, ...] | None,
-    eps: tuple[float, ...] | None,
-    window: str | None,
-    output: options.OutputOptions,
-    **search: Any,
-) -> None:
+def critical(system: SystemOptions, V: Values, eps: Values, window: str | None, output: OutputOptions, **search: Any) -> None:
     """Every critical load at the given velocities, numbered from low W0.
 
     The growth rate is sampled along W0, refined where a pair of crossings could hide, and each sign change is polished on
@@ -123,14 +115,14 @@ srf response --V 10 --W0 6 --mean --eps 0.05,0.1,0.2 --over f=20:400:30
 @click.option("--tol", type=float, help="Relative error of the mean friction; 1e-6 unless set.")
 @options.output_options
 def response(
-    system: options.SystemOptions,
+    system: SystemOptions,
     V: str | None,
     W0: str | None,
-    eps: tuple[float, ...] | None,
-    over: tuple[options.Range, ...],
+    eps: Values,
+    over: tuple[Range, ...],
     mean: bool,
     tol: float | None,
-    output: options.OutputOptions,
+    output: OutputOptions,
 ) -> None:
     """How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t).
 
@@ -178,13 +170,13 @@ srf floquet --V 8 --W0 9 --eps 0.09 --json --tol 1e-9
 @click.option("--fail-on", type=click.Choice(["unstable", "stable"]), help="Exit with code 4 if the state is as named.")
 @options.output_options
 def floquet(
-    system: options.SystemOptions,
+    system: SystemOptions,
     V: str | None,
     W0: str | None,
     eps: str | None,
     tol: float | None,
     fail_on: str | None,
-    output: options.OutputOptions,
+    output: OutputOptions,
     **settings: Any,
 ) -> int:
     """The forced periodic state at one V, W0 and eps: multipliers, mean friction, harmonics.
@@ -233,15 +225,15 @@ srf continue --eps 0.09 --law log-log --ageing dieterich+linker-dieterich
 @options.mesh_option(least=64)
 @options.output_options
 def continue_(
-    system: options.SystemOptions,
-    eps: tuple[float, ...] | None,
+    system: SystemOptions,
+    eps: Values,
     V: str | None,
     W0: str | None,
-    over: tuple[options.Range, ...],
+    over: tuple[Range, ...],
     step: float,
     max_steps: int,
     tol: float | None,
-    output: options.OutputOptions,
+    output: OutputOptions,
     **search: Any,
 ) -> None:
     """The stability boundary of the forced sliding state in a plane of two parameters.
