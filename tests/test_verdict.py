@@ -12,7 +12,7 @@ import pytest
 from srfcli.core.settings import Parameter
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, neutral_values
 from srfcli.diagnosis.scores import Score
-from srfcli.diagnosis.verdict import HELD_OUT_RMS, MISSED, TEMPER, UNEXPLAINED, Conclusion, Model, Predicted, interesting, judge
+from srfcli.diagnosis.verdict import MISSED, TEMPER, UNEXPLAINED, Conclusion, Model, Predicted, interesting, judge
 from srfcli.laws.registry import bundled_registry
 
 SHIPPED = bundled_registry()
@@ -28,8 +28,8 @@ def model(*names: str, evidence: float, passes: bool = True, run: str = "", **kn
     return Model(Hypothesis(effects), evidence, () if passes else ("a stretch of steps is off",), **known)
 
 
-def held(rms: float, gain: float = 1.0, **known: Any) -> Predicted:
-    return Predicted("again", gain, rms, 400, **known)
+def held(rms: float, gain: float = 1.0, size: int = 400, **known: Any) -> Predicted:
+    return Predicted("again", gain, rms, size, **known)
 
 
 def concluded(*models: Model, **found: Any) -> Conclusion:
@@ -89,14 +89,26 @@ def test_nothing_is_missing_only_where_it_could_have_been_seen(sizes, verdict):
     ("runs", "verdict"),
     [
         ([held(1.0)], "identified"),
-        ([held(1.0), held(1.5 * HELD_OUT_RMS)], "unknown"),
+        ([held(1.3)], "unknown"),
+        ([held(1.0, size=4000), held(1.2)], "unknown"),
+        ([held(1.3, size=50)], "identified"),
         ([held(1.0, gain=-5.0)], "identified"),
         ([held(1.0, gain=-7.0)], "unknown"),
         ([held(1.0, gain=-7.0), held(1.0, gain=5.0)], "identified"),
         ([held(1.0, followed=False)], "unknown"),
         ([held(1.0, loud="the gauge's noise is 2.00 times what the recording shows")], "unknown"),
     ],
-    ids=["predicted", "not predicted", "as well as by the baseline", "worse", "well enough in all", "not followed", "loud"],
+    ids=[
+        "predicted",
+        "not predicted",
+        "not predicted in one",
+        "too short to tell",
+        "as well as by the baseline",
+        "worse",
+        "well enough in all",
+        "not followed",
+        "loud",
+    ],
 )
 def test_held_out_runs_refuse(runs, verdict):
     found = concluded(DRAG, LOST, held=runs)

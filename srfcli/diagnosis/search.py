@@ -182,7 +182,7 @@ class ModelSearch:
         self.count = 0
         self._expected: dict[str, float] = {}  # the most that was expected of each effect beside the baseline
         self._taken: set[tuple[Callable[[Fitted], Any], str]] = set()  # steps, and of which model
-        self._tried: dict[str, Array] = {}  # from where each other ageing law was tried last
+        self._tried: dict[str, tuple[bool, Array]] = {}  # each other ageing law: whether to its maximum, and from where, last
 
     def progress(self, text: str) -> None:
         """Tell what is done; where the budget is spent, end what is bounded by it."""
@@ -399,8 +399,8 @@ class ModelSearch:
         best, base = self.best(), self.baseline
         if best.passes:  # other laws are tried near it alone, unless field or noise are there to make up for a law
             masked = taken_up(base.fit) and best.random and not best.hypothesis.ageing
-            steps: list[_Step] = [(self._fit_afresh, base) if masked else (self._try_ageing_laws, best)]
-            steps += [(self._expand_without_field, base)]
+            steps: list[_Step] = [(self._fit_afresh, base)] if masked else []
+            steps += [(self._try_ageing_laws, best), (self._expand_without_field, base)]
         else:
             steps = [(self._fit_afresh, base)]
             steps += [(self._try_ageing_laws, best)] if best.hypothesis.ageing else []
@@ -793,9 +793,9 @@ class ModelSearch:
         """Push the other ageing laws, each after a few steps from where the baseline or the best model stands.
 
         The law with the largest expected likelihood is scored further: the right one lies farther off than a step tells. If the
-        best model has another law than the stated one, it is to be the likeliest of them, and each is scored to its maximum.
+        best model has an effect, or another law than the stated one, each is scored to its maximum: the right one lies far off.
         """
-        whole = bool(best.hypothesis.ageing)
+        whole = bool(best.hypothesis.reported)
         reached = [(law[0], *near) for law in self._other_laws(best) if (near := self._near(*law, whole))]
         for number, (hypothesis, likelihood, found) in enumerate(sorted(reached, key=lambda r: -r[2].expected)):
             if number == 0 and found.away > 1.0:
@@ -818,9 +818,10 @@ class ModelSearch:
         starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in parents]
         heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts] if len(starts) > 1 else [0.0]
         x = starts[int(np.argmax(heights))]
-        if np.array_equal(x, self._tried.get(hypothesis.name, ())):
+        how_far, tried = self._tried.get(hypothesis.name, (False, ()))
+        if how_far >= whole and np.array_equal(x, tried):
             return None
-        self._tried[hypothesis.name] = x
+        self._tried[hypothesis.name] = whole, x
         how: dict[str, Any] = {} if whole else {"steps": NEAR_STEPS, "widths": ()}
         return likelihood, maximise(likelihood, x, close=1.0, progress=self.progress, **how)
 

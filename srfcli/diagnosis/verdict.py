@@ -18,14 +18,13 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import BETWEEN_SAMPLES, Experiment, told_of_runs
-from srfcli.diagnosis.goodness_of_fit import improbability, loudness, shortcomings, uneven_noise
+from srfcli.diagnosis.goodness_of_fit import LOUD, improbability, loudness, shortcomings, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, typical_sizes
 from srfcli.diagnosis.scores import Remainder, Score, own_values
 from srfcli.diagnosis.search import CLOSE, NEAR, SEARCH_RTOL, WORTH, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.state_space import NEEDED, Filtered, StateSpaceFit, fit_state_space, log_evidence, maximise  # fmt: skip
+from srfcli.inference.state_space import DEVIATION, NEEDED, Filtered, StateSpaceFit, fit_state_space, log_evidence, maximise
 
-HELD_OUT_RMS = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
 ABSORBED_SHARE = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
 ALIKE = 0.97  # likeness of two effects' projected columns beyond which they are one class
 BEHIND = 50.0  # in log evidence, by how much a model may be behind and still be asked what it predicts
@@ -78,6 +77,11 @@ class Predicted:
     followed: bool = True
     loud: str = ""
     excess: float = 0.0
+
+    @property
+    def loudness(self) -> float:
+        """Return the rms over that of noise: over LOUD, or what as many residuals may have, if that is more."""
+        return self.rms / max(LOUD, 1 + DEVIATION / float(np.sqrt(2 * self.size)))
 
 
 @dataclass(frozen=True)
@@ -411,9 +415,10 @@ def refusal(runs: Sequence[Predicted], loads: Sequence[Predicted] = ()) -> str:
         return "held-out runs cannot be followed"
     if loud := next((f"what is left in {r.name} as noise, {r.loud}" for r in runs if r.loud), ""):
         return f"held-out runs are not predicted: with {loud}"
-    rms = float(np.sqrt(np.average([r.rms**2 for r in runs], weights=[r.size for r in runs])))
-    if not rms < HELD_OUT_RMS:
-        return f"held-out runs are not predicted: innovations have an rms of {rms:.3f} with the parameters moved as they may"
+    worst = max(runs, key=lambda r: r.loudness)
+    if not worst.loudness < 1.0:
+        said = f"innovations of {worst.name} have an rms of {worst.rms:.3f} with the parameters moved as they may"
+        return f"held-out runs are not predicted: {said}"
     gain = sum(r.gain for r in runs)
     if gain < -CLOSE:
         return f"held-out runs are predicted worse than by the baseline: log likelihood {gain:+.1f}"
