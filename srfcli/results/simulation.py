@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 MANY_BREAKS = 50  # a recorded load has knots, not changes
 OSCILLATION_SAMPLES = 20  # show no oscillation
 OTHERS = (  # what a record has beside the first observable, where it is asked for
-    *(Column(name, unit, "what another gauge shows") for name, unit in OBSERVABLES.items()),
+    Column("elongation", "um", "what another gauge shows"),
+    Column("force", "N", "what another gauge shows"),
+    Column("friction", "1", "what another gauge shows"),
     Column("slip", "um", "slip of the slider since the first sample"),
     Column("contact_area", "1", "contact area over that of contacts of 1 s"),
 )
