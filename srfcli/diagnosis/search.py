@@ -421,8 +421,11 @@ class ModelSearch:
         for node in parts.values():
             self.progress(f"{node.name}: all readings")
             found = self._state_space(self._problem(node.hypothesis, node.fit.values), part=node.fit, processes=processes)
-            fitted[node.name] = replace(self._judged(node.hypothesis, found), scores=node.scores)
-            processes = found.likelihood.processes
+            judged = self._judged(node.hypothesis, found)
+            if processes is None:  # more readings show more colour
+                judged = self._more_coloured(judged)
+            fitted[node.name] = replace(judged, scores=node.scores)
+            processes = judged.fit.likelihood.processes
         self.fitted = fitted
         self._grant_shared_field()
 
@@ -653,13 +656,16 @@ class ModelSearch:
         return self._record(self._judged(base.hypothesis, found))
 
     def _with_more_colour(self, best: Fitted) -> None:
-        """Fit the best model with as much coloured noise as Schwarz's criterion wants, where nothing else speaks against it.
-
-        No effect is expected to explain then why innovations are correlated.
-        """
+        """Fit the best model with more coloured noise, where that is all that it lacks: no effect is expected to explain it."""
         if best.against == (CORRELATED,):
-            found = self._state_space(best.fit.likelihood.problem, part=best.fit, cautious=False)
-            self._record(self._judged(best.hypothesis, found))
+            self._record(self._more_coloured(best))
+
+    def _more_coloured(self, node: Fitted) -> Fitted:
+        """Return a model with as much coloured noise as Schwarz's criterion wants, if nothing else speaks against it."""
+        if node.against != (CORRELATED,):
+            return node
+        found = self._state_space(node.fit.likelihood.problem, part=node.fit, cautious=False)
+        return self._judged(node.hypothesis, found)
 
     def _try_rivals(self, best: Fitted) -> None:
         """Fit what does the same at first order in the place of one effect of the best model, or of its ageing law.
