@@ -866,6 +866,8 @@ class ModelSearch:
         for side in (-1, 1):
             x = found.point.x.copy()
             x[place] = np.clip(x[place] + side * np.log(2), likelihood.lower[place], likelihood.upper[place])
+            if x[place] == found.point.x[place]:  # it stands at its bound
+                continue
             other = maximise(likelihood, x, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
             if other.point.log_likelihood > found.point.log_likelihood + NEEDED:
                 return self._at_another_size(likelihood, other, size)
