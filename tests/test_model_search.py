@@ -195,6 +195,15 @@ def test_the_right_model_is_left_at_no_wrong_maximum(tmp_path, number, kind, con
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("number", "law"), [(102, "nagata"), (149, "dieterich")])
+def test_an_ageing_law_is_found_behind_an_effect_that_passes(tmp_path, number, law):
+    """From where the effect stands a few steps of scoring leave the right law hundreds to thousands below it."""
+    make_case(tmp_path / "case", (9603576, number), kind="ageing", bank="wide")
+    found = said(tmp_path / "case", effects=None)
+    assert found.verdict == "identified" and found.best.hypothesis.reported == (law,)
+
+
+@pytest.mark.slow
 def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(ageing):
     """A search that takes every third reading says what one of all does; its fits are to all, at the same maximum."""
     experiment = read_experiment(ageing, registry=SHIPPED, holdout=False)
