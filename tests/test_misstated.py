@@ -79,7 +79,7 @@ def test_a_parameter_that_is_another_in_one_run_is_told(tmp_path: Path) -> None:
 def test_a_free_start_is_diagnosed_where_an_effect_brings_an_age_of_its_own(tmp_path: Path) -> None:
     record(tmp_path / "run", "--start", "phi=0.3 s")
     assert 'initial = "free"' in (tmp_path / "run" / "experiment.toml").read_text()
-    found = srfcli.diagnose(tmp_path / "run")
+    found = srfcli.diagnose(tmp_path / "run", effects=["second-state", "stiffness-error"])
     assert found.verdict in ("none", "inconclusive") and "second-state" in found.diagnosis.detectable
 
 
