@@ -30,8 +30,15 @@ def srf(*arguments: str, compiler: bool, tmp_path: Path) -> subprocess.Completed
     )  # fmt: skip
 
 
-def test_simulate_says_what_it_costs(tmp_path: Path) -> None:
-    done = srf("simulate", *STEPS, "--out-dir", "steps", compiler=False, tmp_path=tmp_path)
+@pytest.fixture(scope="module")
+def simulated_without(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """A folder in which a recording was simulated without a compiler, and what the command said."""
+    folder = tmp_path_factory.mktemp("without")
+    return folder, srf("simulate", *STEPS, "--free", "A", "--out-dir", "steps", compiler=False, tmp_path=folder)
+
+
+def test_simulate_says_what_it_costs(simulated_without: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    tmp_path, done = simulated_without
     warnings = [line for line in done.stderr.splitlines() if line.startswith("Warning")]
     assert done.returncode == 0 and len(warnings) == 1
     assert "no C compiler was found" in warnings[0] and "as long" in warnings[0] and "pip install ziglang" in warnings[0]
@@ -45,9 +52,9 @@ def test_simulate_says_what_it_costs(tmp_path: Path) -> None:
     assert last("steps") == pytest.approx(last("again"), abs=1e-4)
 
 
-def test_a_fit_and_a_diagnosis_say_it(tmp_path: Path) -> None:
+def test_a_fit_and_a_diagnosis_say_it(simulated_without: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    tmp_path, _ = simulated_without
     folder = tmp_path / "steps"
-    srf("simulate", *STEPS, "--free", "A", "--out-dir", str(folder), compiler=False, tmp_path=tmp_path)
     fit = srf("fit", str(folder), compiler=False, tmp_path=tmp_path)
     assert fit.returncode == 2 and "Try: pip install ziglang, or install cc, gcc or clang" in fit.stderr
     diagnosis = srf("diagnose", str(folder), compiler=False, tmp_path=tmp_path)
