@@ -246,7 +246,7 @@ def run(*arguments):
     return done.exit_code, done.stdout, done.stderr
 
 
-SMALL = ("--over", "V=5:40:12", "--over", "K/W0=0.006:0.03:20", "--eps", "0.13")
+SMALL = ("--over", "V=5:40:6", "--over", "K/W0=0.006:0.03:10", "--eps", "0.13")
 
 
 def test_the_command_compares(tmp_path):
