@@ -30,7 +30,7 @@ def sample() -> list[tuple[Any, ...]]:
     """Return few systems that hold every law, ageing law and interface, and those two by two with loading and inertia."""
     found = []
     for i in range(8):
-        interface, loading, inertia = INTERFACES[i % 4], ("vertical", "inclined")[i // 4], (i % 4 + i // 4) % 2 == 0
+        interface, loading, inertia = INTERFACES[i % 4], ("vertical", "inclined")[i // 4], (i % 4 + i // 4) % 2 == 1
         found.append((LAWS[i % len(LAWS)], AGEINGS[i % len(AGEINGS)], interface, loading, inertia))
     return found
 
