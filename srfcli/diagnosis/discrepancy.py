@@ -69,7 +69,8 @@ class RunForce:
     def csv(self) -> str:
         """Return the run as a table, in full precision."""
         heads = ("time [s]", "friction", "low", "high", "v [um/s]", "phi [s]", "W [N]", "dlnWdt [1/s]", "slip [um]")
-        rows = (",".join(map(repr, row)) for row in zip(*(column.tolist() for column in vars(self).values()), strict=True))
+        columns = (self.t, self.force, self.low, self.high, self.v, self.phi, self.W, self.dlnWdt, self.slip)
+        rows = (",".join(map(repr, row)) for row in zip(*(c.tolist() for c in columns), strict=True))
         return "\n".join([",".join(heads), *rows]) + "\n"
 
 

@@ -31,9 +31,10 @@ PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it
 STEADY = 2.0  # gauge's noise: a stretch whose readings are expected to vary by less is one of steady sliding
 CORRELATED = "innovations are correlated"
 LEVELS = ("gauge_white", "gauge_colour")
-LOUD = 1.15  # gauge noise over that which differences of the recording show, beyond which it holds something else
+LOUD = 1.15  # gauge noise over that of differences, and held-out innovations, beyond which they hold something else
 REPEATED = 0.72  # share of readings that repeat the one before where a step is four times white noise; at six values are off
-THIRD = 1.16  # relative variance, times n, of a level that third differences of n samples tell: (1 + 2 sum rho^2) / 2
+# relative variance, times n, of a level that n uncorrelated numbers tell, and third differences: (1 + 2 sum rho^2) / 2
+UNCORRELATED, THIRD = 0.5, 1.16
 
 
 def shortcomings(found: StateSpaceFit) -> list[str]:
@@ -112,9 +113,13 @@ def loudness(likelihood: Likelihood, point: Point) -> list[tuple[float, str]]:
         quantum = max(q for _, q, _ in shown) / np.sqrt(12)
         for seen, _, n in shown:
             ratio = float(np.hypot(point.values[name], quantum)) / seen
-            size = ratio / max(LOUD, 1 + DEVIATION * float(np.sqrt(THIRD / max(n, 1))))
-            tests.append((size, f"the gauge's noise is {ratio:.2f} times what the recording shows"))
+            tests.append((over_noise(ratio, n, THIRD), f"the gauge's noise is {ratio:.2f} times what the recording shows"))
     return tests
+
+
+def over_noise(ratio: float, n: int, variance: float = UNCORRELATED) -> float:
+    """Return a level over that of noise, over what it may be: LOUD, or DEVIATION by its relative `variance` over n, if more."""
+    return ratio / max(LOUD, 1 + DEVIATION * float(np.sqrt(variance / max(n, 1))))
 
 
 def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[float, str]]:

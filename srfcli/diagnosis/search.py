@@ -657,8 +657,9 @@ class ModelSearch:
 
     def _with_more_colour(self, best: Fitted) -> None:
         """Fit the best model with more coloured noise, where that is all that it lacks: no effect is expected to explain it."""
-        if best.against == (CORRELATED,):
-            self._record(self._more_coloured(best))
+        coloured = self._more_coloured(best)
+        if coloured is not best:
+            self._record(coloured)
 
     def _more_coloured(self, node: Fitted) -> Fitted:
         """Return a model with as much coloured noise as Schwarz's criterion wants, if nothing else speaks against it."""

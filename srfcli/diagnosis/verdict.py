@@ -18,12 +18,12 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import BETWEEN_SAMPLES, Experiment, told_of_runs
-from srfcli.diagnosis.goodness_of_fit import LOUD, improbability, loudness, shortcomings, uneven_noise
+from srfcli.diagnosis.goodness_of_fit import improbability, loudness, over_noise, shortcomings, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, typical_sizes
 from srfcli.diagnosis.scores import Remainder, Score, own_values
 from srfcli.diagnosis.search import CLOSE, NEAR, SEARCH_RTOL, WORTH, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.state_space import DEVIATION, NEEDED, Filtered, StateSpaceFit, fit_state_space, log_evidence, maximise
+from srfcli.inference.state_space import NEEDED, Filtered, StateSpaceFit, fit_state_space, log_evidence, maximise
 
 ABSORBED_SHARE = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
 ALIKE = 0.97  # likeness of two effects' projected columns beyond which they are one class
@@ -77,11 +77,6 @@ class Predicted:
     followed: bool = True
     loud: str = ""
     excess: float = 0.0
-
-    @property
-    def loudness(self) -> float:
-        """Return the rms over that of noise: over LOUD, or what as many residuals may have, if that is more."""
-        return self.rms / max(LOUD, 1 + DEVIATION / float(np.sqrt(2 * self.size)))
 
 
 @dataclass(frozen=True)
@@ -415,8 +410,8 @@ def refusal(runs: Sequence[Predicted], loads: Sequence[Predicted] = ()) -> str:
         return "held-out runs cannot be followed"
     if loud := next((f"what is left in {r.name} as noise, {r.loud}" for r in runs if r.loud), ""):
         return f"held-out runs are not predicted: with {loud}"
-    worst = max(runs, key=lambda r: r.loudness)
-    if not worst.loudness < 1.0:
+    worst = max(runs, key=lambda r: over_noise(r.rms, r.size))
+    if not over_noise(worst.rms, worst.size) < 1.0:
         said = f"innovations of {worst.name} have an rms of {worst.rms:.3f} with the parameters moved as they may"
         return f"held-out runs are not predicted: {said}"
     gain = sum(r.gain for r in runs)

@@ -245,9 +245,7 @@ def field_correlation(found: StateSpaceFit) -> float:
 
 def slip_along(run: Run, x: Array, states: tuple[str, ...]) -> Array:
     """Return the slip (n,) in um along smoothed states, from the run's start on."""
-    if (
-        "u" in states
-    ):  # exact, where stick-slip is faster than the samples: what the stage moved less what the spring was stretched
+    if "u" in states:  # what the stage moved less what the spring was stretched: exact where stick-slip is faster than samples
         u = x[:, states.index("u")]
         return np.asarray(run.start + (run.drive.displacement(run.t) - (u - u[0])))
     v = np.exp(x[:, states.index("ln_v")])
