@@ -196,6 +196,19 @@ def test_the_right_model_is_left_at_no_wrong_maximum(tmp_path, number, kind, con
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "concealed"), [(44, "load-stiffening+poisson-coupling"), (117, "sensor-lag+poisson-coupling")]
+)
+def test_two_effects_are_found_where_coloured_noise_hides_the_second(tmp_path, number, concealed, monkeypatch):
+    """A single effect fitted with coloured noise ends 450 to 900 below the pair, where no score leads to the second."""
+    monkeypatch.setattr("srfcli.diagnosis.search.BUDGET", 3600.0)  # the pair is fitted after some 200 s
+    names = tuple(concealed.split("+"))
+    make_case(tmp_path / "case", (9603576, number), kind="pair", effects=names, bank="wide")
+    found = said(tmp_path / "case", effects=None)
+    assert found.verdict == "identified" and set(found.effects) == set(names)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "law"), [(102, "nagata"), (149, "dieterich")])
 def test_an_ageing_law_is_found_behind_an_effect_that_passes(tmp_path, number, law):
     """From where the effect stands a few steps of scoring leave the right law hundreds to thousands below it."""

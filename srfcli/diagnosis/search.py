@@ -146,6 +146,16 @@ class _Move:
     gains: Mapping[tuple[str, str], float] = field(compare=False, default_factory=dict)  # without field, of all: by name and run
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """A model begun from the start values of the file: its likelihood with the baseline's colour and without, where it got."""
+
+    hypothesis: Hypothesis
+    beside: Likelihood
+    own: Likelihood
+    found: Maximum
+
+
 class _Spent(Exception):
     """The budget is used up."""
 
@@ -182,6 +192,8 @@ class ModelSearch:
         self.count = 0
         self._expected: dict[str, float] = {}  # the most that was expected of each effect beside the baseline
         self._taken: set[tuple[Callable[[Fitted], Any], str]] = set()  # steps, and of which model
+        self._afresh: dict[str, _Trial] = {}  # models that were begun from the start values of the file
+        self._followed: set[str] = set()  # models that were fitted from the start values of the file
         self._tried: dict[str, tuple[bool, Array]] = {}  # each other ageing law: whether to its maximum, and from where, last
 
     def progress(self, text: str) -> None:
@@ -346,7 +358,8 @@ class ModelSearch:
             base = self._expand(self._with_own_noise(base))
             if taken_up(base.fit):  # field or noise make up for what is missing: without them it shows, or it is another law
                 self._take(self._expand_without_field, base)
-                if self._within_reach(base):  # what is likelier where it begins, else what is expected to be
+                self._take(self._fit_likeliest_afresh, base)
+                if not self._explained and self._within_reach(base):  # what is likelier where it begins, else what is expected
                     move = max(self.queue, key=lambda m: (max(self._reached(m, base), base.evidence), -m.expected))
                     self._fit_next(self._taken_out(move))
                 self._between_runs()
@@ -743,38 +756,91 @@ class ModelSearch:
         if not self.experiment.runs:
             self._try_ageing_laws(best)
             return
-        models = list(self._other_laws(best))
+        models = [hypothesis for hypothesis, _ in self._other_laws(best)]
         singles = [Hypothesis((effect,)) for effect in ([] if base.passes or best.passes else self._joining(base))]
-        for single in sorted(singles, key=lambda h: (h.name in self.fitted, -self._expected.get(h.name, -np.inf))):
-            known, (effect,) = self.fitted.get(single.name), single.effects
-            likelihood = None if known and known.passes else self._likelihood(single, base, effect.reported)
-            models += [(single, likelihood)] if likelihood else []
+        for single in sorted(singles, key=lambda h: -self._expected.get(h.name, -np.inf)):
+            known = self.fitted.get(single.name)
+            models += [] if known and known.passes else [single]
         highest = self._without_colour(best) if best.name != base.name else -np.inf
-        waiting: list[tuple[Hypothesis, Likelihood, Likelihood, Maximum]] = []
-        for hypothesis, beside in models:
-            own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
-            start = next(wide_starts(own, {}, self.progress), None)
-            if start is None:
-                continue
-            found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
-            waiting.append((hypothesis, beside, own, found))
-            if not taken_up(StateSpaceFit(own, found)):
-                highest = max(highest, self._carry_on(*waiting.pop(), highest))
-                if self.best().passes and self.best().hypothesis.reported:
+        others, highest = self._follow([m for m in models if m.name not in self._followed], highest)
+        if not self._explained:
+            for trial in sorted(others, key=lambda t: -t.found.point.log_likelihood)[:FEWEST]:
+                highest = self._carry_on(trial, highest)
+                if self._explained:
                     return
-        for trial in sorted(waiting, key=lambda w: -w[3].point.log_likelihood)[:FEWEST]:
-            highest = max(highest, self._carry_on(*trial, highest))
-            if self.best().passes and self.best().hypothesis.reported:
-                return
 
-    def _carry_on(self, hypothesis: Hypothesis, beside: Likelihood, own: Likelihood, found: Maximum, highest: float) -> float:
-        """Fit a model begun from the start values of the file where enough is expected of it; return the likelihood it reached.
+    def _fit_likeliest_afresh(self, base: Fitted) -> None:
+        """Fit the effects of which most is expected, and what they lack then, from the file's own start values."""
+        likeliest = {m.hypothesis.name: m.hypothesis for m in sorted(self.queue) if -m.expected > base.evidence}
+        self._follow([m for m in list(likeliest.values())[:FEWEST] if not any(e.run for e in m.effects)], -np.inf)
 
-        With coloured noise as that of the baseline, too. What is far behind the highest, without coloured noise, is left.
+    @property
+    def _explained(self) -> bool:
+        """Return whether a model with an effect, or another law, is the best and passes."""
+        return self.best().passes and bool(self.best().hypothesis.reported)
+
+    def _follow(self, models: Sequence[Hypothesis], highest: float) -> tuple[list[_Trial], float]:
+        """Begin models from the start values of the file, and fit those that keep a field no wider than one may be.
+
+        Until one passes. Return the others, and the highest log likelihood that was reached under white noise.
         """
+        others = []
+        for hypothesis in models:
+            trial = self._begun_afresh(hypothesis)
+            if trial is not None and taken_up(StateSpaceFit(trial.own, trial.found)):
+                others.append(trial)
+            elif trial is not None:
+                highest = self._carry_on(trial, highest)
+                if self._explained:
+                    break
+        return others, highest
+
+    def _begun_afresh(self, hypothesis: Hypothesis) -> _Trial | None:
+        """Return where a few steps lead from the start values of the file, under a wide field and white gauge noise."""
+        if hypothesis.name in self._afresh:
+            return self._afresh[hypothesis.name]
+        name = hypothesis.effects[-1].reported if hypothesis.effects else hypothesis.ageing
+        beside = self._likelihood(hypothesis, self.baseline, name)
+        if beside is None:
+            return None
+        own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
+        start = next(wide_starts(own, {}, self.progress), None)
+        if start is None:
+            return None
+        found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
+        trial = self._afresh[hypothesis.name] = _Trial(hypothesis, beside, own, found)
+        return trial
+
+    def _with_a_second(self, trial: _Trial) -> _Trial | None:
+        """Return the likeliest model of one effect more, begun from the start values of the file; None if none is far likelier.
+
+        It is scored under white noise: coloured noise, or a field wider than one may be, takes up a part of what is missing.
+        """
+        fit, hypothesis = StateSpaceFit(trial.own, trial.found), trial.hypothesis
+        if len(hypothesis.effects) == MOST_EFFECTS or taken_up(fit) or not set(shortcomings(fit)) - {CORRELATED}:
+            return None
+        self.progress(f"{hypothesis.name}: scores under white noise")
+        gains = self._gains(self._scores(self._passed(hypothesis, fit)))
+        likeliest = [score.effect for gain, score in sorted(gains, key=lambda p: -p[0])[:FEWEST] if gain > WORTH]
+        pairs = [self._begun_afresh(Hypothesis((*hypothesis.effects, effect), hypothesis.ageing)) for effect in likeliest]
+        likelier = [p for p in pairs if p and p.found.expected > fit.log_likelihood + WORTH]
+        return max(likelier, key=lambda p: p.found.point.log_likelihood, default=None)
+
+    def _carry_on(self, trial: _Trial, highest: float) -> float:
+        """Fit a model begun from the start values of the file where enough is expected of it, and first what it lacks.
+
+        With coloured noise as that of the baseline, too. What is far behind the highest log likelihood under white noise, which is
+        returned, is left.
+        """
+        hypothesis, beside, own, found = trial.hypothesis, trial.beside, trial.own, trial.found
+        self._followed.add(hypothesis.name)
         places = [near] if hypothesis.ageing and (near := self._near(hypothesis, beside)) else []
         if found.away > 1.0 and found.point.log_likelihood > highest - HOPELESS:
             found = maximise(own, found.point.x, close=1.0, progress=self.progress)
+        if found.point.log_likelihood > highest and (pair := self._with_a_second(replace(trial, found=found))):
+            highest = self._carry_on(pair, highest)
+            if self._explained:
+                return highest
         highest = max(highest, found.point.log_likelihood)
         places.append((own, found))
         if beside.processes and found.point.log_likelihood > highest - HOPELESS:
@@ -787,7 +853,7 @@ class ModelSearch:
                 self._fit_next(move)
             else:
                 self._push([move])
-        return found.point.log_likelihood
+        return highest
 
     def _without_colour(self, node: Fitted) -> float:
         """Return the log likelihood of a fitted model where its gauge noise is white."""
