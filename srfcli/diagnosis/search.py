@@ -829,8 +829,8 @@ class ModelSearch:
     def _carry_on(self, trial: _Trial, highest: float) -> float:
         """Fit a model begun from the start values of the file where enough is expected of it, and first what it lacks.
 
-        With coloured noise as that of the baseline, too. What is far behind the highest log likelihood under white noise, which is
-        returned, is left.
+        With coloured noise as that of the baseline, too. What is far behind the highest log likelihood under white noise is left.
+        That is returned.
         """
         hypothesis, beside, own, found = trial.hypothesis, trial.beside, trial.own, trial.found
         self._followed.add(hypothesis.name)
@@ -839,8 +839,6 @@ class ModelSearch:
             found = maximise(own, found.point.x, close=1.0, progress=self.progress)
         if found.point.log_likelihood > highest and (pair := self._with_a_second(replace(trial, found=found))):
             highest = self._carry_on(pair, highest)
-            if self._explained:
-                return highest
         highest = max(highest, found.point.log_likelihood)
         places.append((own, found))
         if beside.processes and found.point.log_likelihood > highest - HOPELESS:
