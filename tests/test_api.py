@@ -7,6 +7,7 @@ import doctest
 import importlib
 import inspect
 import json
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -290,6 +291,17 @@ WRONG = {
     "a trend": (lambda s: srf.fit("here", trend="up"), "`trend`: 'up'"),
     "a name twice": (lambda s: srf.fit("here", free="A,A"), "named twice"),
     "no start": (lambda s: srf.fit("here", starts=0), "one start or more"),
+    "a law as slider": (lambda s: srf.critical("srf-vsat"), "`system`: 'srf-vsat' is of a wrong type"),
+    "a number as folder": (lambda s: srf.fit(3), "`experiment`: 3 is of a wrong type"),
+    "text as tolerance": (lambda s: srf.floquet(s, tol="x"), "`tol`: 'x' is of a wrong type"),
+    "a number among names": (lambda s: srf.derive(s, extras=["jacobian", 3]), "`extras`: '3'"),
+    "a number as law": (lambda s: srf.compare({"a": s, "b": 3}), "`systems`: {"),
+    "text as an end": (lambda s: srf.compare({"a": s, "b": s}, V=(5, "20")), "`V`: (5, '20')"),
+    "points of a map": (lambda s: srf.compare({"a": s, "b": s}, points={"V": 8}), "`points`: 'V'"),
+    "settings": (lambda s: srf.continue_boundary(s, settings=3), "`settings` 3"),
+    "a mapping as start": (lambda s: srf.simulate(s, t=TIMES, start={"v": 1}), "`start` {'v': 1} is no state"),
+    "code as inertia": (lambda s: srf.system(inertia="print()"), "neither True nor False"),
+    "no evaluations": (lambda s: srf.fit_thresholds("here.csv", s, free="A", max_evaluations=0), "one or more"),
     "a part": (lambda s: srf.derive(s, extras="hessian"), "`extras`: 'hessian'"),
     "an effect's formulas": (lambda s: srf.derive(srf.system(effects="viscous-drag")), "no part in a derivation"),
     "code of a gauge": (lambda s: srf.code(srf.system(effects="sensor-lag")), "critical loads do not depend on"),
@@ -387,3 +399,11 @@ runs = [{ name = "run", file = "run.csv" }]
     model = srf.system("dieterich-ruina", ageing="ruina", interface="rigid", inertia=False).model
     p = run_parameters(model, experiment, experiment.runs[0], {})
     assert p[model.index("K")] == pytest.approx(21 * 9.80665e-3)
+
+
+def test_other_errors_of_python_stay() -> None:
+    with pytest.raises(TypeError, match="missing 1 required keyword-only argument: 'stiffness'"):
+        srf.new_experiment("run.csv")
+    with pytest.raises(TypeError, match="nosuch"):
+        srf.critical(srf.system(), nosuch=3)
+    assert pickle.loads(pickle.dumps(srf.fit)) is srf.fit  # as workers get it

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.core.arguments import explained
 from srfcli.core.errors import SrfError, as_names
 from srfcli.core.settings import DEFAULTS, Parameter, Resolved, resolve
 from srfcli.laws.registry import Registry, chosen_instead, load_registry
@@ -90,6 +91,7 @@ class SlidingSystem:
         return f"<SlidingSystem: {self.title}>"
 
 
+@explained
 def system(
     law: str = str(DEFAULTS["law"].value),
     *,
@@ -147,7 +149,9 @@ def system(
     effects = as_names(effects, "effects")
     words = [w.strip() for text in (law, ageing, interface, *effects) for w in text.split("+")]
     registry = load_registry([Path(p) for p in plugins], named=[Path(w) for w in words if w.endswith(".py")])
-    names = {"law": law, "ageing": ageing, "interface": interface, "loading": loading, "inertia": inertia}
+    if inertia not in (True, False):
+        raise SrfError(f"`inertia` {inertia!r} is neither True nor False", "True, where the slider's mass counts.")
+    names = {"law": law, "ageing": ageing, "interface": interface, "loading": loading, "inertia": bool(inertia)}
     opener = Opener(registry, names, effects)
     model = opener.motion if why_not_steady(registry, effects) else opener.model
     given = {**(parameters or {}), **more}
@@ -224,6 +228,7 @@ def declared(model: GeneratedModel) -> tuple[Parameter, ...]:
     return tuple(p for p in model.parameters if p not in RUN_SYMBOLS)
 
 
+@explained
 def load_law(name: str | Path, *, kind: str = "friction", plugins: Sequence[str | Path] = ()) -> Law:
     """Return a law as a value: its formula, parameters, references and checks.
 

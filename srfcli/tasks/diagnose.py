@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from srfcli.codegen.c_source import GET_COMPILER, compiler
+from srfcli.core.arguments import explained
 from srfcli.core.errors import SrfError, as_names, check_choice, did_you_mean
 from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import BY, grouped
@@ -23,6 +24,7 @@ from srfcli.laws.values import Effect
 from srfcli.results.diagnosis import DiagnosisResult
 
 
+@explained
 def diagnose(
     experiment: Experiment | Path | str,
     *,

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import GeneratedModel
-from srfcli.core.errors import SrfError, Status
+from srfcli.core.arguments import explained
+from srfcli.core.errors import SrfError, Status, check_choice
 from srfcli.core.parallel import Runner, run_here
 from srfcli.core.settings import require_parameter
 from srfcli.core.units import to_base
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
 
 
+@explained
 def map(  # the command's own name
     system: SlidingSystem,
     *,
@@ -159,6 +161,7 @@ def _boundaries(
 # `compare`: the stability diagrams of several laws, brought to the same observables at one low velocity.
 
 
+@explained
 def compare(
     systems: Mapping[str, SlidingSystem],
     *,
@@ -231,6 +234,8 @@ def compare(
         loads = (K / K_over_W0[1], K / K_over_W0[0]) if K_over_W0[0] > 0 else (0.0, 0.0)
     if not (V[0] > 0 and loads[0] > 0):
         raise SrfError("the window begins at 0", "The window is logarithmic: begin above 0.")
+    for name in points or {}:
+        check_choice("points", name, ("columns", "rows"))
     window = Window(V=V, W0=loads, **(points or {}))
     check_count(window.columns, window.rows)
     usable = [k for k, m in enumerate(matches) if m.status.ok]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from srfcli.core.arguments import explained
 from srfcli.core.errors import SrfError, Status, as_names, as_pairs, check_choice
 from srfcli.core.parallel import Runner, run_here
 from srfcli.core.settings import resolve
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
 
 
+@explained
 def new_experiment(
     files: Path | str | Sequence[Path | str],
     *,
@@ -181,6 +183,7 @@ def _window(given: tuple[float, float] | str | None) -> tuple[float, float] | No
     return begin, end
 
 
+@explained
 def read_experiment(
     path: str | Path,
     *,
@@ -236,6 +239,7 @@ def read_experiment(
     return description.read_experiment(Path(path), registry=known, format=format, holdout=holdout)
 
 
+@explained
 def check(
     experiment: Experiment | Path | str,
     *,
@@ -298,13 +302,14 @@ def check(
     """
     registry = registry or load_registry([Path(p) for p in plugins])
     if not isinstance(experiment, Experiment):
-        experiment = read_experiment(experiment, registry=registry)
+        experiment = description.read_experiment(Path(experiment), registry=registry)
     experiment.check_recorded("to check")
     found = tuple(description.check_run(run) for run in experiment.named(runs))
     told = forecast(experiment, found, registry=registry, progress=progress) if simulate else None
     return CheckResult(experiment, found, told)
 
 
+@explained
 def fit(
     experiment: Experiment | Path | str,
     *,
@@ -416,7 +421,7 @@ def fit(
         raise SrfError("`track` shared does not go with `profile` or `sample`", "Leave it out, or name rough.")
     registry = registry or load_registry([Path(p) for p in plugins])
     if not isinstance(experiment, Experiment):
-        experiment = read_experiment(experiment, registry=registry)
+        experiment = description.read_experiment(Path(experiment), registry=registry)
     if sample:
         experiment.check_recorded("of which a posterior is drawn")
     found = fit_recordings(
@@ -448,6 +453,7 @@ def fit(
 # Critical loads alone, as in the paper.
 
 
+@explained
 def fit_thresholds(
     table: Thresholds | Path | str,
     system: SlidingSystem,
@@ -516,6 +522,8 @@ def fit_thresholds(
     >>> round(found.values["D0"], 4)
     0.402
     """
+    if max_evaluations is not None and max_evaluations < 1:
+        raise SrfError(f"`max_evaluations` {max_evaluations}: a fit has one or more", "Leave it out.")
     if not isinstance(table, Thresholds):
         table = read_thresholds(Path(table))
     known = system.resolved
@@ -567,6 +575,7 @@ class Task:
     digest: str
 
 
+@explained
 def fit_campaign(
     paths: Sequence[str | Path],
     *,

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.codegen.slider import SlidingSystem, declared
 from srfcli.codegen.splines import appended
+from srfcli.core.arguments import explained
 from srfcli.core.errors import SrfError, Status, as_pairs, did_you_mean, worst
 from srfcli.core.settings import Parameter, check_value, require_parameter
 from srfcli.core.units import find_unit, from_base, parse_quantity, split_quantity, tidy, to_base
@@ -34,6 +35,7 @@ from srfcli.results.simulation import Gauge, Job, Record, SimulationResult, Work
 LARGEST_VELOCITY = 1e9  # um/s
 
 
+@explained
 def simulate(
     system: SlidingSystem,
     *,
@@ -269,7 +271,10 @@ def start_state(
     if isinstance(start, numbers.Real):
         start = repr(float(start))
     if not isinstance(start, str):
-        return np.asarray(start, float)
+        try:
+            return np.asarray(start, float)
+        except (TypeError, ValueError):
+            raise SrfError(f"`start` {start!r} is no state", "Like 10, for steady sliding at 10 um/s.") from None
     if "=" not in start:
         try:
             V = parse_quantity(start, "um/s", name="`start`")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.core.arguments import explained
 from srfcli.core.errors import SrfError, Status, as_names, check_choice, worst
 from srfcli.core.settings import check_value, require_parameter
 from srfcli.core.units import to_base
@@ -67,6 +68,7 @@ def _ends(model: GeneratedModel, window: Any) -> tuple[float, float]:
 # `derive` and `code`: what follows from the laws by algebra, whatever the values.
 
 
+@explained
 def derive(system: SlidingSystem | Opener, *, extras: str | Sequence[str] = ()) -> DerivationResult:
     """Return steady state, slopes of friction, equations, dispersion relation and closed critical loads, by algebra.
 
@@ -115,6 +117,7 @@ def check_paper() -> PaperResult:
     return PaperResult(tuple(paper.check_paper()))
 
 
+@explained
 def code(system: SlidingSystem | Opener) -> CodeResult:
     """Return the NumPy module that computes everything numerical about steady sliding and its stability.
 
@@ -152,6 +155,7 @@ LOADS_TRIED = np.geomspace(1e-3, 1e5, 9)  # um, times K: where there is no Hopf 
 VELOCITIES_TRIED = tuple(np.geomspace(1.0, 100.0, 60).tolist())  # um/s
 
 
+@explained
 def linear(
     system: SlidingSystem, *, over: Mapping[str, Sequence[float] | float] | None = None, all_roots: bool = False
 ) -> LinearResult:
@@ -239,6 +243,7 @@ def _without_hopf(model: GeneratedModel, p: Array) -> str:
 FREQUENCIES = tuple(np.geomspace(1.0, 1000.0, 200).tolist())  # Hz
 
 
+@explained
 def response(
     system: SlidingSystem,
     *,
@@ -311,6 +316,7 @@ def response(
 # `floquet`: one forced periodic state in full.
 
 
+@explained
 def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, harmonics: int = 5) -> PeriodicResult:
     """Return the forced periodic state at the system's V, W0 and eps: multipliers, mean friction, harmonics.
 
@@ -361,6 +367,7 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
 LINES_FOLLOWED = 5  # that are followed outwards to find the loads to look between
 
 
+@explained
 def critical(
     system: SlidingSystem,
     *,
@@ -463,6 +470,7 @@ def _side(g: list[float]) -> str:
     return f"{'stable' if (values < 0).all() else 'unstable'} at every load looked at"
 
 
+@explained
 def continue_boundary(
     system: SlidingSystem,
     *,
@@ -509,6 +517,8 @@ def continue_boundary(
     from srfcli.numerics.continuation import ContinuationSettings
 
     model, settings = system.model, settings or ContinuationSettings()
+    if not isinstance(settings, ContinuationSettings):
+        raise SrfError(f"`settings` {settings!r} are none of a curve", "Like srfcli.ContinuationSettings(tol=1e-8).")
     axes = _axes(model, over or {"V": (1.0, 100.0)}, log, eps is not None)
     model.check_changing_load(system.vector())
     own = system.resolved.values["eps"]
