@@ -130,7 +130,10 @@ def test_an_experiment_is_read_checked_and_fitted(tmp_path: Path, monkeypatch: p
     assert told.plot().axes[0].get_title(loc="left") == told.runs[0].run.name
     with pytest.raises(srf.SrfError, match="no run 'other'"):
         srf.check("steps", runs=["other"])
-    found = srf.fit(srf.read_experiment("steps"), free=["mu0", "D0"], track="smooth")
+    with pytest.raises(srf.SrfError, match="unknown reader 'mat'"):
+        srf.check("steps", reader="mat")
+    found = srf.fit("steps", free=["mu0", "D0"], track="smooth", reader="csv")
+    assert found.log_likelihood == found.table.meta["log_likelihood"]
     options = ("--free", "mu0,D0", "--track", "smooth")
     assert [list(r) for r in found.table.rows] == rows_of("fit", "steps", *options)
     assert found.values["D0"] == pytest.approx(0.402, abs=5 * found.stderr["D0"])
@@ -232,6 +235,15 @@ def test_results_are_frozen_and_have_every_form(linear) -> None:
     assert frame["W0"].tolist() == [row[2] for row in linear.table.rows]
     pytest.importorskip("xarray")
     assert linear.to_xarray()["W0"].attrs["units"] == "N"
+
+
+@pytest.mark.parametrize(("form", "library"), [("to_dataframe", "pandas"), ("to_xarray", "xarray")])
+def test_a_form_names_the_library_that_it_lacks(linear, form: str, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("pandas", "xarray"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(srf.SrfError, match=f"{form} needs {library}") as error:
+        getattr(linear, form)()
+    assert "srfcli[frames]" in error.value.hint
 
 
 def test_a_notebook_shows_a_table_and_escapes_what_it_shows(linear) -> None:

@@ -145,6 +145,11 @@ class FitResult(Result):
         """Return name -> standard error, in um, s, N."""
         return dict(self.found.fit.stderr)
 
+    @property
+    def log_likelihood(self) -> float:
+        """Return the natural log likelihood of the estimates; it compares models fitted to the same data."""
+        return self.found.fit.log_likelihood
+
     def _shown(self, name: str, *values: float | None) -> tuple[str, list[Any]]:
         """Return the unit in which a parameter is shown, and its values (um, s, N) in that unit."""
         declared = self.found.problem.unit_of(name)
@@ -231,7 +236,7 @@ class FitResult(Result):
             "runs": [] if self.runs is None else self.runs.records(),
             "against": self.against,
             "correlation": fit.correlation,
-            "log_likelihood": fit.log_likelihood,
+            "log_likelihood": self.log_likelihood,
             "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
             "evaluations": fit.evaluations,
             "noise": {

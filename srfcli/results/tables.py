@@ -91,16 +91,13 @@ class Table:
 
     def to_xarray(self) -> Any:
         """Return the table as an xarray.Dataset over its rows; raises SrfError where xarray or pandas is not installed."""
+        _xarray()
         frame = self.to_dataframe()
         return self.dataset({name: ("row", frame[name].to_numpy()) for name in frame.columns})
 
     def dataset(self, fields: Mapping[str, Any], **coordinates: Any) -> Any:
         """Return an xarray.Dataset of these fields, each with its column's unit and meaning; raises SrfError without xarray."""
-        try:
-            import xarray
-        except ImportError as error:
-            raise SrfError("to_xarray needs xarray, which is not installed", 'pip install "srfcli[frames]"') from error
-        made = xarray.Dataset(fields, **coordinates)
+        made = _xarray().Dataset(fields, **coordinates)
         for column in self.columns:
             made[column.name].attrs = {"units": column.unit, "long_name": column.about}
         made.attrs = {"title": self.title, "status": self.status}
@@ -122,6 +119,15 @@ class Table:
         notes = [*([f"{left} more rows"] if left else []), *self.notes]
         shown = tag("table", tag("thead", tag("tr", head)), tag("tbody", body))
         return tag("div", tag("b", self.title), shown, tag("ul", [tag("li", note) for note in notes]) if notes else "")
+
+
+def _xarray() -> Any:
+    """Return xarray, which needs pandas."""
+    try:
+        import xarray
+    except ImportError as error:
+        raise SrfError("to_xarray needs xarray, which is not installed", 'pip install "srfcli[frames]"') from error
+    return xarray
 
 
 def plain_value(value: Any) -> Any:

@@ -245,6 +245,7 @@ def check(
     *,
     runs: Sequence[str] = (),
     simulate: bool = True,
+    reader: str | None = None,
     plugins: Sequence[str | Path] = (),
     registry: Registry | None = None,
     progress: Callable[[str], None] = lambda run: None,
@@ -254,15 +255,17 @@ def check(
     Parameters
     ----------
     experiment : path or Experiment
-        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`, which also takes a reader.
+        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`.
     runs : sequence of str
         Names of runs; all if left out.
     simulate : bool
         Whether each run is simulated, to say what its load can tell.
+    reader : str, optional
+        Reader of all data files; each is told from its name and content if left out.
     plugins : sequence of path
-        Folders in which laws are looked for, too.
+        Folders in which laws and readers are looked for, too.
     registry : Registry, optional
-        An open registry of laws; loaded from `plugins` and the usual places if left out.
+        An open registry of laws and readers; loaded from `plugins` and the usual places if left out.
     progress : callable
         Told the name of each run before it is simulated.
 
@@ -302,7 +305,7 @@ def check(
     """
     registry = registry or load_registry([Path(p) for p in plugins])
     if not isinstance(experiment, Experiment):
-        experiment = description.read_experiment(Path(experiment), registry=registry)
+        experiment = description.read_experiment(Path(experiment), registry=registry, format=reader)
     experiment.check_recorded("to check")
     found = tuple(description.check_run(run) for run in experiment.named(runs))
     told = forecast(experiment, found, registry=registry, progress=progress) if simulate else None
@@ -323,6 +326,7 @@ def fit(
     profile: bool = False,
     sample: int | None = None,
     seed: int = 0,
+    reader: str | None = None,
     plugins: Sequence[str | Path] = (),
     registry: Registry | None = None,
     progress: Callable[[str, str, float | None], None] = lambda stage, text, share: None,
@@ -335,7 +339,7 @@ def fit(
     Parameters
     ----------
     experiment : path or Experiment
-        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`, which also takes a reader.
+        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`.
     free : str or sequence of str, optional
         Parameters to fit; those that the experiment leaves free if left out.
     trend : {'slip', 'time', 'none'}, optional
@@ -358,10 +362,12 @@ def fit(
         How many points of the posterior are drawn, with emcee.
     seed : int
         Of further starts and of the sampler.
+    reader : str, optional
+        Reader of all data files; each is told from its name and content if left out.
     plugins : sequence of path
-        Folders in which laws are looked for, too.
+        Folders in which laws and readers are looked for, too.
     registry : Registry, optional
-        An open registry of laws; loaded from `plugins` and the usual places if left out.
+        An open registry of laws and readers; loaded from `plugins` and the usual places if left out.
     progress : callable
         Told the stage (fit, profile, sample), what is done, and which share of the stage where that is known.
 
@@ -421,7 +427,7 @@ def fit(
         raise SrfError("`track` shared does not go with `profile` or `sample`", "Leave it out, or name rough.")
     registry = registry or load_registry([Path(p) for p in plugins])
     if not isinstance(experiment, Experiment):
-        experiment = description.read_experiment(Path(experiment), registry=registry)
+        experiment = description.read_experiment(Path(experiment), registry=registry, format=reader)
     if sample:
         experiment.check_recorded("of which a posterior is drawn")
     found = fit_recordings(
