@@ -108,7 +108,7 @@ def hidden(text: str) -> set[str]:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     said = ",".join(re.findall(r'pip install -q "\.\[(.*?)\]"', readme) + re.findall(r"<!-- extras: (.*?) -->", text))
     known = packages(set(re.findall(r"\w+", said)))
-    return {name.replace("-", "_") for name in packages({"all", "arviz", "cluster", "frames"}) - known}
+    return {name.replace("-", "_") for name in packages({"all", "arviz", "cluster", "frames", "hdf5", "tdms"}) - known}
 
 
 HIDE = """
