@@ -7,11 +7,6 @@ import hashlib
 import io
 import json
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -312,33 +307,15 @@ def test_what_does_not_converge_is_written_all_the_same(arguments: tuple[str, ..
     assert "Not finished: " in done.stderr and "Traceback" not in done.stderr
 
 
-def interrupted_after(seconds: float, arguments: Sequence[str]) -> tuple[int, str]:
-    """Start `srf`, send it SIGINT after a while, and return its exit code and stderr."""
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    script = [sys.executable, "-m", "srfcli.cli.main", *arguments]
-    with subprocess.Popen(script, env=env, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            time.sleep(seconds)
-            assert process.poll() is None, "it was done before it could be interrupted"
-            process.send_signal(signal.SIGINT)
-            return process.wait(1200), process.stderr.read() if process.stderr else ""
-        finally:
-            process.kill()
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals")
-@pytest.mark.parametrize("command", ["continue", "critical"])
-def test_ctrl_c_keeps_what_is_done(command: str, empty_folder: Path) -> None:
-    amplitudes = ",".join(f"{eps:g}" for eps in (0.045, *(0.4 + 0.002 * k for k in range(50))))  # minutes of work
-    more = {"continue": [], "critical": ["--V", ",".join(map(str, range(20, 70)))]}[command]
-    text = ""
-    for seconds in (2.0, 6.0, 15.0, 40.0):  # the first rows take one second, more on a busy machine
-        arguments = [command, "--eps", amplitudes, *more, "--out", "x.csv", "--force"]
-        code, said = interrupted_after(seconds, arguments)
-        assert code == 130 and "Interrupted" in said and "Traceback" not in said, said
-        text = (empty_folder / "x.csv").read_text(encoding="utf-8") if Path("x.csv").exists() else ""
-        if text.count("\n") > 1:
-            break
+@pytest.mark.parametrize(
+    ("arguments", "moment"),
+    [(("continue", "--over", "V=10:30"), " 30 points"), (("critical", "--V", "20,30,40"), "V = 30 um/s")],
+    ids=["continue", "critical"],
+)
+def test_ctrl_c_keeps_what_is_done(arguments: tuple[str, ...], moment: str, empty_folder: Path, srf_ended_at) -> None:
+    code, _, said = srf_ended_at(moment, *arguments, "--eps", "0.045,0.4", "--out", "x.csv")
+    assert code == 130 and "Interrupted" in said and "Traceback" not in said, said
+    text = (empty_folder / "x.csv").read_text(encoding="utf-8")
     rows: list[dict[str, Any]] = table(text)
     assert columns(text)[: len(BOUNDARY)] == BOUNDARY and text.endswith("\n")
     assert rows and all(None not in row.values() and None not in row for row in rows)  # no line is cut

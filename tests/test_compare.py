@@ -128,6 +128,7 @@ def test_an_interrupted_study_is_none(model):
     """At whatever moment: half a study, kept by --resume, would be taken for a whole one."""
     task = LawTask(model.source, model.key, model.vector(), (0.13,), Window((5.0, 40.0), (5.0, 40.0), 5, 7), onset=1.0)
     part = LawPart(task, 0.13, mapped=True)
+    study_part(part)  # compiled from here on
     begun = time.process_time()
     whole = study_part(part)
     spent = time.process_time() - begun

@@ -205,8 +205,8 @@ def go(end):
     return integrate(model, p, drive=Drive.constant(8.0), load=Modulation(9.0, 0.1, 120.0, 0.0), t=np.array([0.0, end]),
                      start=np.asarray(model.steady(p)), rtol=1e-11, atol=np.full(4, 1e-11))
 go(0.01)  # compiled from here on
-print("begun", flush=True)
 try:
+    print("begun", flush=True)
     go(300.0)
 except KeyboardInterrupt:
     print("interrupted", flush=True)
@@ -220,7 +220,7 @@ def test_an_interruption_acts_within_compiled_code():
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == "begun\n"
-        time.sleep(0.5)  # within the integration, which would take half a minute
+        time.sleep(0.5)  # within the integration, which would take half a minute; on a busy machine perhaps before it
         process.send_signal(signal.SIGINT)
         assert process.stdout.readline() == "interrupted\n"
         assert process.wait(timeout=1200) == 0
