@@ -15,8 +15,13 @@ from pathlib import Path
 import click
 import pytest
 
+from srfcli.cli import options
+from srfcli.cli import prove as cli_prove
+from srfcli.cli import system as cli_system
 from srfcli.cli.main import COMMANDS, cli
 from srfcli.core.errors import SrfError
+from srfcli.symbolic import derivation, system
+from srfcli.validation import cases
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "srfcli"
@@ -190,6 +195,13 @@ def test_a_constant_means_the_same_everywhere() -> None:
         for name, _ in numbers(path):
             found.setdefault(name, []).append(module)
     assert len(found) > 300 and not {name: places for name, places in found.items() if len(places) > 1}
+
+
+def test_choices_of_light_commands_are_those_of_what_they_import_late() -> None:
+    assert options.LOADINGS == system.LOADINGS
+    assert cli_system.LONG_PARTS == derivation.EXTRAS
+    assert (cli_prove.KINDS, cli_prove.BANKS) == (cases.WIDE_KINDS, cases.BANKS)
+    assert set(cli_prove.TRACKS) == set(cases.TRACKS)
 
 
 def test_constants_in_the_docs_are_those_of_the_code() -> None:

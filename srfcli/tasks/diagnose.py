@@ -11,7 +11,7 @@ from srfcli.codegen.c_source import GET_COMPILER, compiler
 from srfcli.core.arguments import explained
 from srfcli.core.errors import SrfError, as_names, check_choice, did_you_mean
 from srfcli.data.experiment import read_experiment
-from srfcli.data.groups import BY, grouped
+from srfcli.data.groups import BY, TRENDS, grouped
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.design import discriminating_run
 from srfcli.diagnosis.discrepancy import best_form, explain_unknown
@@ -95,7 +95,7 @@ def diagnose(
     srfcli.core.errors.SrfError: unknown effect 'linker-dietrich'
     """
     begun = time.perf_counter()
-    check_choice("trend", trend, ("slip", "time", "none"))
+    check_choice("trend", trend, (*TRENDS, "none"))
     check_choice("by", by, BY)
     effects, vary = as_names(effects, "effects"), as_names(vary, "vary")
     registry = registry or load_registry([Path(p) for p in plugins])

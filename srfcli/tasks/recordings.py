@@ -22,7 +22,7 @@ from srfcli.core.units import from_base, parse_quantity, split_quantity, to_base
 from srfcli.data import experiment as description
 from srfcli.data.columns import open_source
 from srfcli.data.draft import Wish, draft
-from srfcli.data.groups import BY
+from srfcli.data.groups import BY, TRENDS
 from srfcli.data.thresholds import Thresholds, read_thresholds
 from srfcli.data.values import Experiment, Run
 from srfcli.inference import posterior as posteriors
@@ -418,7 +418,7 @@ def fit(
     (True, 10, True)
     """
     check_choice("track", track, ("smooth", "rough", "shared"))
-    check_choice("trend", trend, ("slip", "time", "none"))
+    check_choice("trend", trend, (*TRENDS, "none"))
     check_choice("by", by, BY)
     free, vary = None if free is None else as_names(free, "free"), as_names(vary, "vary")
     if starts < 1 or (sample is not None and sample < 2):
