@@ -62,8 +62,8 @@ class DraftResult(TextResult):
         return Table("srf.new/1", columns, rows, "Columns of the recordings", self.draft.remarks)
 
     def write(self, path: Path | str | None = None, *, force: bool = False) -> None:
-        """Write the text to experiment.toml in the folder, or to a file of another name there, whole or not at all."""
-        super().write(self.folder / (path or "experiment.toml"), force=force)
+        """Write the text to a file, whole or not at all; experiment.toml in the folder if left out."""
+        super().write(self.folder / "experiment.toml" if path is None else path, force=force)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
