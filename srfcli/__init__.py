@@ -5,9 +5,9 @@
     slider = srf.system("srf-vsat", K="0.21 N/um")
     srf.linear(slider).plot()
 
-`system`, `load_law` and `read_experiment` prepare the input. Every other function does the work of one command and returns a
-result with `.table`, `.to_dataframe()`, `.to_xarray()` and, unless it is a text, `.plot()`; `continue_boundary` returns an
-iterator of such results.
+`system`, `load_law` and `read_experiment` prepare the input, and `run_processes` spreads independent work. Every other function
+does the work of one command and returns a result with `.table`, `.to_dataframe()`, `.to_xarray()` and, unless it is a text,
+`.plot()`; `continue_boundary` returns an iterator of such results.
 """
 
 from __future__ import annotations
@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     from srfcli.codegen.slider import system as system
     from srfcli.core.errors import SrfError as SrfError
     from srfcli.core.errors import Status as Status
+    from srfcli.core.parallel import run_processes as run_processes
+    from srfcli.numerics.continuation import ContinuationSettings as ContinuationSettings
+    from srfcli.numerics.continuation import StepSettings as StepSettings
+    from srfcli.numerics.plane import MapAxis as MapAxis
+    from srfcli.numerics.plane import MapSettings as MapSettings
     from srfcli.tasks.diagnose import diagnose as diagnose
     from srfcli.tasks.map import compare as compare
     from srfcli.tasks.map import map as map
@@ -47,7 +52,11 @@ if TYPE_CHECKING:
 
 # name: the module that has it, imported when the name is first used
 PUBLIC = {
+    "ContinuationSettings": "srfcli.numerics.continuation",
+    "MapAxis": "srfcli.numerics.plane",
+    "MapSettings": "srfcli.numerics.plane",
     "SlidingSystem": "srfcli.codegen.slider",
+    "StepSettings": "srfcli.numerics.continuation",
     "SrfError": "srfcli.core.errors",
     "Status": "srfcli.core.errors",
     "code": "srfcli.tasks.stability",
@@ -68,6 +77,7 @@ PUBLIC = {
     "new_experiment": "srfcli.tasks.recordings",
     "prove": "srfcli.validation.trials",
     "read_experiment": "srfcli.tasks.recordings",
+    "run_processes": "srfcli.core.parallel",
     "simulate": "srfcli.tasks.simulate",
     "system": "srfcli.codegen.slider",
 }

@@ -67,11 +67,39 @@ def run_here(function: Callable[[Task], Result], tasks: Sequence[Task]) -> Itera
 def run_processes(
     function: Callable[[Task], Result], tasks: Sequence[Task], *, workers: int, lost: Callable[[int], Result] | None = None
 ) -> Iterator[tuple[int, Result]]:
-    """Yield (index, result) of every task as it is finished by one of `workers` processes.
+    """Return an iterator of (index, result) of every task as it is finished by one of `workers` processes.
 
-    `function` must be importable and tasks and results must pickle. A task whose worker died is done again; where it takes
-    MOST_CRASHES workers with it, `lost` gives what stands in place of its result, and without `lost` SrfError is raised. Raises
-    what `function` itself raised.
+    With a number of workers it is what `srfcli.map`, `srfcli.compare` and `srfcli.fit_campaign` take as `run`.
+
+    Parameters
+    ----------
+    function : callable
+        What is done with each task; it must be importable.
+    tasks : sequence
+        Independent tasks; they and their results must pickle.
+    workers : int
+        How many processes work at the same time.
+    lost : callable, optional
+        Gives, for the index of a task that takes MOST_CRASHES workers with it, what stands in place of its result.
+
+    Returns
+    -------
+    iterator of (int, result)
+        A task whose worker died is done again.
+
+    Raises
+    ------
+    SrfError
+        For a task that takes MOST_CRASHES workers with it, without `lost`; and what `function` itself raises.
+
+    Examples
+    --------
+    >>> import functools
+    >>> import srfcli as srf
+    >>> two = functools.partial(srf.run_processes, workers=2)
+    >>> found = srf.map(srf.system(eps=0.18), x=("V", 10, 40, 3), y=("W0", 8, 20, 3), boundaries=False, run=two)
+    >>> found.status.ok
+    True
     """
     waiting, attempts = deque(range(len(tasks))), [0] * len(tasks)
     crew = [_started() for _ in range(min(workers, len(tasks)))]

@@ -196,6 +196,25 @@ class Experiment:
 
     Parameters in `vary` have a value for each run, load, segment or direction, as that says of each; `by` is what they vary with
     unless it is said. Observables drift with slip or time where there is a `trend`.
+
+    Attributes
+    ----------
+    path : path
+        The folder's experiment.toml.
+    choice : ModelChoice
+        The laws that are believed.
+    mass : float or None
+        Mass of the slider in N s^2/um (1 kg is 1e-6).
+    stiffness_text : str
+        Stiffness of the apparatus, as the description has it.
+    parameters : tuple of FitParameter
+        Start values and bounds in um, s, N, and whether each is held fixed.
+    runs : tuple of Run
+        The recordings: times (n,) in s, observables (n,) in um, N or 1.
+    notices : tuple of Notice
+        What is odd in the description.
+    thresholds : tuple of CriticalLoads
+        Tables of critical loads.
     """
 
     path: Path

@@ -86,7 +86,27 @@ HYPOTHESES_SHOWN = 8  # hypotheses that are shown
 
 @dataclass(frozen=True, repr=False)
 class DiagnosisResult(Result):
-    """What `srfcli.diagnose` found: `verdict`, `effects`, `confidence`, and the whole `answer` as `srf.diagnose/1` has it."""
+    """What `srfcli.diagnose` found: `verdict`, `effects`, `confidence`, and the whole `answer` as `srf.diagnose/1` has it.
+
+    Attributes
+    ----------
+    diagnosis : Diagnosis
+        The fits of the models that were compared, their evidence, and the verdict.
+    location : Location
+        Where the baseline's residual stands out: in time, velocity, load, slip and phase, in um, s, N.
+    registry : Registry
+        The effects that were looked for.
+    missing : mapping
+        What an unknown effect is like; empty for another verdict.
+    discriminating : DiscriminatingRun, optional
+        The run that would tell ambiguous models apart.
+    stopped : bool
+        Whether Ctrl-C ended the search.
+    reader, seed : str or None, int
+        As they were asked for.
+    seconds : float
+        How long it took.
+    """
 
     diagnosis: Diagnosis = field(repr=False)
     location: Location = field(repr=False)
