@@ -8,6 +8,7 @@ import importlib
 import inspect
 import json
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -60,6 +61,14 @@ def test_a_public_function_says_what_it_takes_and_returns(name: str) -> None:
         assert parameter in told, f"srf.{name} does not say what {parameter} is"
 
 
+def test_the_reference_has_every_public_name_and_every_result() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "api.md").read_text(encoding="utf-8")
+    returned = " ".join(str(inspect.signature(getattr(srf, name)).return_annotation) for name in FUNCTIONS)
+    results = set(re.findall(r"\w+Result", returned))
+    assert len(results) > 15 and all(f"heading: {name}\n" in page for name in results)
+    assert all(f"heading: srf.{name}\n" in page for name in srf.__all__)
+
+
 def test_nothing_heavy_is_imported_before_it_is_used() -> None:
     code = "import sys, srfcli; print(sorted({'numpy', 'sympy', 'scipy', 'click', 'matplotlib'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -82,7 +91,7 @@ def test_commands_print_what_the_functions_return(slider: srf.SlidingSystem, lin
     *parts, boundary = srf.continue_boundary(slider, eps=0.18, over={"V": (20, 40)})
     assert [list(r) for r in boundary.table.rows] == rows_of("continue", "--eps", "0.18", "--over", "V=20:40")
     counts = [len(part.boundaries[0].branches) for part in parts]
-    assert counts == sorted(counts) and counts[-1] == len(boundary.boundaries[0].branches) > 1  # it grows
+    assert counts == sorted(counts) and counts[0] < counts[-1] == len(boundary.boundaries[0].branches)  # it grows
     state = srf.floquet(slider.at(V=8, W0=9, eps=0.09))
     assert [list(r) for r in state.table.rows] == rows_of("floquet", "--V", "8", "--W0", "9", "--eps", "0.09")
     gains = srf.response(slider.at(V=10, W0=6), over={"f": (10, 20, 60)})
@@ -190,6 +199,9 @@ def test_an_experiment_is_drafted_as_by_the_command(tmp_path: Path, monkeypatch:
     assert srf.read_experiment(tmp_path).runs[0].t.size == 181
     with pytest.raises(srf.SrfError, match="exists already"):
         made.write()
+    Path("other").mkdir()
+    srf.new_experiment("run.csv", columns=columns, drive=3, folder="other", **said).write("here.toml")
+    assert Path("here.toml").is_file() and not [*Path("other").iterdir()]  # a path is seen from the working folder, as elsewhere
     for wrong, text in (
         ({"stiffness": None}, "the stiffness of the machine is in no table"),
         ({"stiffness": "55"}, "`stiffness` '55' has no unit"),
@@ -227,6 +239,10 @@ def test_comparing_names_what_was_matched() -> None:
 def test_results_are_frozen_and_have_every_form(linear) -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         linear.over = {}
+    *_, found = srf.continue_boundary(srf.system(), over={"V": (20, 22)})
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        found.boundaries[0].notes = ()
+    assert isinstance(found.boundaries[0].notes, tuple) and isinstance(found.boundaries[0].branches, tuple)
     assert repr(linear) == "<LinearResult: srf-vsat, dieterich, elastic, vertical, inertia on; 3 rows, ok>"
     assert "7.28316" in str(linear) and linear.parameters["K"]["value"] == 0.21
     pandas = pytest.importorskip("pandas")

@@ -11,7 +11,7 @@ branch that passes through it, or by a new branch that starts there. What closes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -357,25 +357,30 @@ class Branch:
         return np.stack([point.p for point in self.points], axis=1)
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Boundary:
     """The components found in a window; `notes` say what was looked at and what was not."""
 
     plane: Plane
-    branches: list[Branch]
-    scans: list[LineScan]
-    notes: list[str]
+    branches: tuple[Branch, ...] = ()
+    scans: tuple[LineScan, ...] = ()
+    notes: tuple[str, ...] = ()
     status: Status = Status.OK
 
-    def conclude(self, missed: int) -> None:
-        """Set the status of a finished search that left `missed` sign changes without a boundary point."""
-        if self.status is not Status.OK:
-            return
-        ends = {end for branch in self.branches for end in (branch.start, branch.end)}
-        if missed or not all(point.status.ok for branch in self.branches for point in branch.points):
-            self.status = Status.NO_CONVERGENCE
-        else:
-            self.status = next((s for s in (Status.STEP_TOO_SMALL, Status.MAX_STEPS) if s in ends), Status.OK)
+    def with_branches(self, branches: Iterable[Branch]) -> Boundary:
+        """Return the boundary with these components, too."""
+        return replace(self, branches=(*self.branches, *branches))
+
+    def concluded(self, notes: Iterable[str], missed: int) -> Boundary:
+        """Return the result of a finished search, which left `missed` sign changes without a boundary point."""
+        status = self.status
+        if status is Status.OK:
+            ends = {end for branch in self.branches for end in (branch.start, branch.end)}
+            if missed or not all(point.status.ok for branch in self.branches for point in branch.points):
+                status = Status.NO_CONVERGENCE
+            else:
+                status = next((s for s in (Status.STEP_TOO_SMALL, Status.MAX_STEPS) if s in ends), Status.OK)
+        return replace(self, notes=tuple(notes), status=status)
 
 
 SAME_BOUNDARY = 1e-3  # of the window's height
@@ -389,12 +394,12 @@ def find_components(
     A KeyboardInterrupt ends the search: what was followed until then is polished and yielded, with status INTERRUPTED.
     """
     settings = settings or ContinuationSettings()
-    boundary = Boundary(plane, [], [], [])
+    boundary = Boundary(plane)
     curves: list[Curve] = []
     missed = 0
     try:
         for scan in _scan_lines(model, plane, settings, progress):
-            boundary.scans.append(scan)
+            boundary = replace(boundary, scans=(*boundary.scans, scan))
             for bracket in _unclaimed(model, plane, scan, curves):
                 start = _starting_point(model, plane, scan, bracket, settings)
                 if start is None:
@@ -407,15 +412,13 @@ def find_components(
                 curve = trace(model, plane, start, settings.steps, progress, f"component {len(curves) + 1}: ")
                 if len(curve.points) > 1:
                     curves.append(curve)
-                    boundary.branches.extend(polish_curve(model, plane, curve, settings))
+                    boundary = boundary.with_branches(polish_curve(model, plane, curve, settings))
                 if curve.end is Status.INTERRUPTED:
                     raise KeyboardInterrupt
                 yield boundary
     except KeyboardInterrupt:
-        boundary.status = Status.INTERRUPTED
-    boundary.notes = _notes(model, boundary, settings, missed)
-    boundary.conclude(missed)
-    yield boundary
+        boundary = replace(boundary, status=Status.INTERRUPTED)
+    yield boundary.concluded(_notes(model, boundary, settings, missed), missed)
 
 
 def _scan_lines(model: GeneratedModel, plane: Plane, settings: ContinuationSettings, progress: Progress) -> Iterator[LineScan]:

@@ -73,7 +73,7 @@ class Discontinuity:
     orbit: Discretisation
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class StabilityMap:
     """A map: `leading` (nx, ny), the leading multiplier, NaN where no orbit was found; `mesh` (nx, ny) intervals.
 

@@ -64,7 +64,7 @@ def find_boundaries(
     A KeyboardInterrupt ends the search: what was followed until then is yielded, with status INTERRUPTED.
     """
     settings = settings or ContinuationSettings()
-    boundary = Boundary(found.grid.plane(model), [], [], [])
+    boundary = Boundary(found.grid.plane(model))
     waiting = sorted(found.seeds, key=lambda s: (float(np.ptp(s.ends, axis=0).max()), -s.axis))[::-1]
     discontinuities = list(found.discontinuities)
     traced: list[_Traced] = []
@@ -93,28 +93,21 @@ def find_boundaries(
             curve = follow_curve(model, boundary.plane, start, settings, progress)
             if len(curve.points) > 1:
                 traced.append(_dense(curve))
-                boundary.branches.extend(polish_curve(model, boundary.plane, curve, settings))
+                boundary = boundary.with_branches(polish_curve(model, boundary.plane, curve, settings))
                 waiting = [s for s in waiting if not passes(traced[-1], s)]
                 discontinuities = [b for b in discontinuities if not ends_state(traced[-1], b)]
             if curve.end is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             yield boundary
     except KeyboardInterrupt:
-        boundary.status = Status.INTERRUPTED
-    _conclude(boundary, found, sum(not any(passes(t, seed) for t in traced) for seed in missed))
-    yield boundary
-
-
-def _conclude(boundary: Boundary, found: StabilityMap, missed: int) -> None:
-    """Set the notes and the status of a finished search."""
-    boundary.notes = map_notes(found)
-    if missed:
-        boundary.notes.append(f"{missed} sign changes of the map could not be polished to a point of a boundary")
+        boundary = replace(boundary, status=Status.INTERRUPTED)
+    lost = sum(not any(passes(t, seed) for t in traced) for seed in missed)
+    notes = map_notes(found)
+    if lost:
+        notes.append(f"{lost} sign changes of the map could not be polished to a point of a boundary")
     if any(pt.kind == "fold" for b in boundary.branches for pt in b.points):
-        boundary.notes.append(
-            "at a boundary of type fold a forced state ends: beyond it the map shows another one, where it finds any"
-        )
-    boundary.conclude(missed)
+        notes.append("at a boundary of type fold a forced state ends: beyond it the map shows another one, where it finds any")
+    yield boundary.concluded(notes, lost)
 
 
 def map_notes(found: StabilityMap) -> list[str]:

@@ -139,7 +139,7 @@ def _boundaries(
 ) -> tuple[Boundary, list[list[SpecialPoint]], list[NDArray[np.float64]]]:
     """Return the components, the special points of each, and the cubic coefficient at each point (NaN unless wanted)."""
     if not followed:
-        return Boundary(found.grid.plane(model), [], [], []), [], []
+        return Boundary(found.grid.plane(model)), [], []
     *_, boundary = find_boundaries(model, found, settings, progress=lambda said: progress(f"boundaries: {said}"))
     special: list[list[SpecialPoint]] = [[] for _ in boundary.branches]
     cubic = [np.full(len(b.points), np.nan) for b in boundary.branches]
@@ -153,8 +153,8 @@ def _boundaries(
             changes = criticality_points(model, boundary.plane, branch, cubic[k])
             special[k] = sorted([*special[k], *changes], key=lambda s: s.place)
     except KeyboardInterrupt:
-        boundary.status = Status.INTERRUPTED
-        boundary.notes.append("interrupted: special points and criticality are not complete")
+        said = "interrupted: special points and criticality are not complete"
+        boundary = replace(boundary, status=Status.INTERRUPTED, notes=(*boundary.notes, said))
     return boundary, special, cubic
 
 

@@ -543,7 +543,7 @@ def _grown(
                 yield BoundaryResult(system, (*done, boundary), worst([*(a.status for a in done), boundary.status]))
             assert boundary is not None
             if window is not None:
-                _judge_window(model, boundary, window)
+                boundary = _judged_window(model, boundary, window)
             done.append(boundary)
             if boundary.status is Status.INTERRUPTED:
                 break
@@ -592,17 +592,17 @@ def _plane(system: SlidingSystem, axes: list[Axis], amplitude: float | None) -> 
     return Plane(base, x, Axis("W0", window.lo, window.hi)), window
 
 
-def _judge_window(model: GeneratedModel, boundary: Boundary, window: LoadWindow) -> None:
-    """Say in `boundary` where its curves leave the loads that were found, and what of those loads is not certain."""
-    x = boundary.plane.x.name
+def _judged_window(model: GeneratedModel, boundary: Boundary, window: LoadWindow) -> Boundary:
+    """Return the boundary with notes on where its curves leave the loads that were found, and what of these is not certain."""
+    x, notes, status = boundary.plane.x.name, list(boundary.notes), boundary.status
     for number, branch in enumerate(boundary.branches, 1):
         for point in (branch.points[0], branch.points[-1]):
             W0 = point.value(model, "W0")
             side = "above" if 0.999 * window.hi < W0 else "below" if 1.001 * window.lo > W0 else ""
             if side:
                 at = f"{x} = {model.declared(x, point.value(model, x)):.4g}"
-                boundary.notes.append(f"component {number} goes on {side} W0 = {W0:.4g} N at {at} (--over W0=LOW:HIGH for more)")
+                notes.append(f"component {number} goes on {side} W0 = {W0:.4g} N at {at} (--over W0=LOW:HIGH for more)")
     if not window.certain:
-        boundary.notes.append(f"crossings below {window.lo:.4g} or above {window.hi:.4g} N are not ruled out")
-        if boundary.status is Status.OK:
-            boundary.status = Status.UNSETTLED
+        notes.append(f"crossings below {window.lo:.4g} or above {window.hi:.4g} N are not ruled out")
+        status = Status.UNSETTLED if status is Status.OK else status
+    return replace(boundary, notes=tuple(notes), status=status)
