@@ -156,6 +156,17 @@ def test_slow_sliding_follows_the_track(flags: tuple[str, ...], empty_folder: Pa
     assert wander == pytest.approx(track(slip), abs=0.1 * np.ptp(wander))
 
 
+def test_what_is_recorded_where_the_elongation_follows_from_the_friction(empty_folder: Path) -> None:
+    """Without inertia and with rigid contacts u is no state: the gauge shows that of the track, and so do force and friction."""
+    field = ("--field", "1e-3", "--field-length", "40", "--seed", "2")
+    c = columns("--interface", "rigid", "--no-inertia", "--V", "1", "--W0", "3", "--for", "20", "--rate", "10", "--K", "0.2",
+                "--observe", "elongation,force,friction", "--quantum", "1e-9,1e-9,1e-9", *field)  # fmt: skip
+    assert np.ptp(c["u"]) > 0.003
+    assert c["measured"] == pytest.approx(c["u"], abs=1e-8)
+    assert c["force"] == pytest.approx(0.2 * c["u"], abs=1e-8)
+    assert c["friction"] == pytest.approx(c["mu"], abs=1e-8)
+
+
 def test_runs_of_an_experiment_share_the_track_where_they_overlap(empty_folder: Path, shared: Path) -> None:
     """Two runs alike but for their noise slide alike; one that begins further on finds what the first finds there."""
     simulate("--V", "2", "--W0", "3", "--for", "20", "--rate", "50", "--out-dir", "made")

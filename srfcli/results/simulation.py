@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import GeneratedModel
-from srfcli.codegen.splines import Spline
+from srfcli.codegen.splines import Spline, appended
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.noise import measured
 from srfcli.data.values import AREA_GROWTH, OBSERVABLES, Declared, Experiment, Run, Signal, shown_unit
@@ -117,7 +117,7 @@ def _along(model: GeneratedModel, job: Job, trace: Trace, name: str) -> Array | 
         return None
     W0 = dict.fromkeys(["W0"], job.load.rest(float(job.t[0])))
     p = model.vector(dict(zip(model.names, job.p.tolist(), strict=True)) | W0)
-    return np.asarray(function(trace.x, trace.V, trace.W, np.zeros_like(trace.W), p))
+    return np.asarray(function(trace.x, trace.V, trace.W, np.zeros_like(trace.W), appended(p, job.tables)))
 
 
 @dataclass(frozen=True)
