@@ -563,6 +563,22 @@ def test_steps_of_the_drive_from_displacements(tmp_path: Path) -> None:
     assert drive.breaks[0] == pytest.approx(6.0, abs=0.02)
 
 
+@pytest.mark.parametrize("jump", [0.0, 0.02])
+def test_a_step_of_the_written_figures_is_no_reset(jump: float, tmp_path: Path) -> None:
+    """An angle of six figures, 1145.9 steps below a degree from sample to sample: each twelfth is a step less. A jump is told."""
+    t = np.arange(1000) / 20
+    angle = np.degrees(np.interp(t, [0, 20, 50], [0, 60, 360]) / 25e3)
+    angle[700:] += jump
+    torque = 15.0 + np.random.default_rng(1).normal(0.0, 0.01, t.size)
+    rows = [f"{row[0]:g},{row[1]:.6g},10,{row[2]:.6g}" for row in zip(t, angle, torque, strict=True)]
+    file, toml = tmp_path / "rot.csv", str(tmp_path / "r.toml")
+    file.write_text("\n".join(["Time (s),Angle (deg),Normal stress (MPa),Torque (N m)", *rows]) + "\n")
+    apparatus = ["--stiffness", "30 MPa/mm", "--radius", "25 mm", "--area", "1 cm^2"]
+    assert CliRunner().invoke(cli, ["new", str(file), *apparatus, "--out", toml]).exit_code == 0
+    told = CliRunner().invoke(cli, ["check", toml, "--no-simulate"]).output
+    assert told.count("the displacement jumps by") == bool(jump)
+
+
 @pytest.mark.parametrize(("noise", "count"), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)], ids=["clean", "noise", "encoder"])
 @pytest.mark.parametrize(
     "steps",

@@ -49,7 +49,10 @@ def drive_of(run: RunDescription, columns: Columns) -> tuple[Drive, list[Notice]
         )
     if role == "load_point_velocity":
         return drive_from_velocity(t, values, where)
-    return drive_from_displacement(t, values, where, correct="reset" in run.corrections)
+    channel = columns.channels[role]
+    unit = channel.factor * channel.spec.scale
+    steps = abs(unit) * written_steps(values / unit - channel.spec.offset / channel.spec.scale)
+    return drive_from_displacement(t, values, where, correct="reset" in run.corrections, steps=steps)
 
 
 def declared_drive(run: RunDescription, columns: Columns, pieces: Sequence[tuple[float, float]]) -> Drive:
@@ -166,10 +169,37 @@ def _piece(t: Array, V: Array, sigma: Array, penalty: float) -> tuple[float, flo
     return mean + slope * (float(t[0]) - middle), slope
 
 
-def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = False) -> tuple[Drive, list[Notice]]:
+MOST_FIGURES = 12  # of a number that was written: more are those of arithmetic
+
+
+def written_steps(x: Array) -> Array:
+    """Return the step of the last figure (n,) with which each number of x (n,) was written, 0 where they show no decimals.
+
+    They have as many decimals each, or as many significant figures: those of the number that has most.
+    """
+    size = np.abs(x)
+    seen = np.isfinite(x) & (size > 0)
+    if not seen.any():
+        return np.zeros(x.shape)
+    decade = np.floor(np.log10(size[seen]))
+    figures = np.full(decade.size, MOST_FIGURES + 1.0)
+    for n in range(MOST_FIGURES, 0, -1):
+        unit = 10.0 ** (decade + 1 - n)
+        figures[np.abs(size[seen] - np.round(size[seen] / unit) * unit) < 8 * np.spacing(size[seen])] = n
+    if figures.max() > MOST_FIGURES:
+        return np.zeros(x.shape)
+    least = float((10.0 ** (decade + 1 - figures)).min())
+    steps = np.full(x.shape, least)
+    steps[seen] = np.maximum(least, 10.0 ** (decade + 1 - figures.max()))
+    return steps
+
+
+def drive_from_displacement(
+    t: Array, X: Array, where: str, *, correct: bool = False, steps: Array | float = 0.0
+) -> tuple[Drive, list[Notice]]:
     """Return the drive in a column of displacements: the slopes of a continuous line of straight pieces through it.
 
-    With `correct` level jumps of the transducer are taken out.
+    With `correct` level jumps of the transducer are taken out. `steps` (n,) are those with which the numbers were written.
     """
     known = np.isfinite(X)
     if known.sum() < 8:
@@ -177,7 +207,7 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
     notices = []
     if not known.all():
         notices.append(Notice("nan", where, f"{int((~known).sum())} samples without a displacement; a line bridges them"))
-    line = corners(t[known], X[known], correct=correct)
+    line = corners(t[known], X[known], correct=correct, steps=np.broadcast_to(steps, X.shape)[known])
     for at, size in line.jumps:
         done = "taken out as a transducer's" if correct else 'left as it is; corrections = ["reset"] takes it out'
         what = f"the displacement jumps by {size:.4g} um after t = {t[known][at]:.7g} s: {done}"
@@ -470,9 +500,10 @@ def _without_corners(t: Array, x: Array, step: float) -> Array:
     return kept
 
 
-def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
+def corners(t: Array, x: Array, *, correct: bool = True, steps: Array | float = 0.0) -> Line:
     """Return the continuous line of straight pieces that x (n,) over t supports, and the level jumps in x.
 
+    A level jump is more than four steps of an encoder, and of the `steps` (n,) with which the numbers near it were written.
     With `correct` the jumps are taken out of x first, in place. The Bayesian information criterion chooses the number of pieces;
     the noise enters it with its correlation over 128 samples. Least squares place the knots. A change of slope by less than 2 %
     comes from the servo and is not followed.
@@ -480,9 +511,10 @@ def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
     white, step = local_noise(x), quantisation(x)
     sigma = coloured_noise(t, x, white, step)
     penalty, jumps = 3 * np.log(t.size), []
+    least = 4 * np.maximum(step, np.broadcast_to(steps, x.shape))
     for _ in range(4):
         breaks = split(t, x, sigma, penalty)
-        found = [jump for jump in _jumps(t, x, sigma, breaks, penalty) if abs(jump[1]) > 4 * step]
+        found = [jump for jump in _jumps(t, x, sigma, breaks, penalty) if abs(jump[1]) > least[jump[0]]]
         jumps += found
         if not found or not correct:
             break
