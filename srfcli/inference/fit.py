@@ -25,6 +25,9 @@ def inverse(information: Array) -> Array:
     return np.asarray(inverse / np.outer(d, d))
 
 
+NO_SAY = 1e4  # times the width of its bounds that a parameter's error is where nothing determines it
+
+
 def solve_scaled(A: Array, b: Array) -> Array:
     """Return the solution of symmetric equations, scaled; directions that nothing determines do not move."""
     d = np.sqrt(np.maximum(np.diag(A), 1e-300))
@@ -88,8 +91,10 @@ class Fit:
 
     @property
     def stderr(self) -> dict[str, float]:
-        """Return the standard errors by name."""
-        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+        """Return the standard errors by name: 0 at a bound, infinite where the recordings have no say."""
+        errors = np.sqrt(np.diag(self.covariance))
+        told = np.where(errors > NO_SAY * (self.upper - self.lower), np.inf, errors)
+        return dict(zip(self.names, told.tolist(), strict=True))
 
     @property
     def correlation(self) -> Array:

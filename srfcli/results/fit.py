@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 PARAMETERS = (
     Column("parameter", "", "name"),
     Column("value", "", "estimate, in the unit beside it"),
-    Column("stderr", "", "standard error; coloured noise allowed for; none at a bound", ".3g"),
+    Column("stderr", "", "standard error; coloured noise allowed for; none at a bound, or where nothing determines it", ".3g"),
     Column("low", "", "lower end of the 95 % interval"),
     Column("high", "", "upper end of the 95 % interval"),
     Column("unit", "", "unit of all the columns before"),
@@ -228,7 +228,7 @@ class FitResult(Result):
         rows = []
         for k, name in enumerate(fit.names):
             value, interval = fit.values[name], profiled.get(name)
-            error = fit.stderr[name] or math.nan  # none at a bound
+            error = fit.stderr[name] if 0 < fit.stderr[name] < math.inf else math.nan  # none at a bound, or of what is not seen
             ends = (value - 1.96 * error, value + 1.96 * error) if interval is None else (interval.low, interval.high)
             unit, (*shown, start) = self._shown(name, value, error, *ends, float(found.problem.start[k]))
             rows.append((name, *shown, unit, start, flag(fit, k)))
@@ -286,14 +286,15 @@ class FitResult(Result):
     def difference(self) -> tuple[float, float | None] | None:
         """Return A - B and its standard error with the covariance of the two, None without both; of what varies, of the means.
 
-        The error is None where one varies or stands at a bound.
+        The error is None where one varies, stands at a bound or is not seen in the recordings.
         """
         found, names, known = self.found, ("A", "B"), self.values_with_means
         if not {*names} <= known.keys():
             return None
         free = [found.fit.names.index(n) for n in names if n in found.fit.names]
         own = np.asarray(found.fit.covariance)[np.ix_(free, free)]
-        if not free or {*names} & found.problem.groups.keys() or not (np.diag(own) > 0).all():
+        known_errors = all(0 < found.fit.stderr[found.fit.names[k]] < math.inf for k in free)
+        if not free or {*names} & found.problem.groups.keys() or not known_errors:
             return known["A"] - known["B"], None
         signs = np.array([1.0 if found.fit.names[k] == "A" else -1.0 for k in free])
         return known["A"] - known["B"], float(np.sqrt(max(float(signs @ own @ signs), 0.0)))
@@ -513,6 +514,8 @@ def flag(fit: Fit, k: int) -> str:
     """Return what stands against an estimate: at a bound, sought no further, not determined, or tied to another parameter."""
     name = fit.names[k]
     width = fit.upper[k] - fit.lower[k]
+    if math.isinf(fit.stderr[name]):
+        return "not identifiable: the recordings have no say in it"
     if min(fit.values[name] - fit.lower[k], fit.upper[k] - fit.values[name]) < NEAR_BOUND * width:
         return "at its lower bound" if fit.values[name] - fit.lower[k] < NEAR_BOUND * width else "at its upper bound"
     if fit.status is Status.INTERRUPTED:

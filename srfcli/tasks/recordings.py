@@ -704,7 +704,7 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     unit, factor = experiment.shown("1/um" if experiment.per_load else "N/um")
 
     def shared(a: str, b: str) -> float | None:
-        if not {a, b} <= place.keys():
+        if not {a, b} <= place.keys() or math.inf in (result.stderr[a], result.stderr[b]):
             return None
         scale = math.prod([factor if name == "K" else from_base(1.0, problem.unit_of(name)) for name in (a, b)])
         return _number(float(covariance[place[a], place[b]]) * scale)
