@@ -7,12 +7,14 @@ readings. Durbin and Koopman 2012.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 from srfcli.codegen.model import Array
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
+from srfcli.inference.fit import fit_problem
 from srfcli.inference.noise import difference_level, stretches
 from srfcli.inference.state_space import (
     DEVIATION,
@@ -32,6 +34,7 @@ STEADY = 2.0  # gauge's noise: a stretch whose readings are expected to vary by 
 CORRELATED = "innovations are correlated"
 LEVELS = ("gauge_white", "gauge_colour")
 LOUD = 1.15  # gauge noise over that of differences, and held-out innovations, beyond which they hold something else
+LEVEL_GAIN, LEVELS_TOLD = 5.0, 6  # in log likelihood for each level, from where it is told, and how many are
 REPEATED = 0.72  # share of readings that repeat the one before where a step is four times white noise; at six values are off
 # relative variance, times n, of a level that n uncorrelated numbers tell, and third differences: (1 + 2 sum rho^2) / 2
 UNCORRELATED, THIRD = 0.5, 1.16
@@ -69,6 +72,40 @@ def uneven_noise(found: StateSpaceFit) -> list[str]:
         if least < -DEVIATION and most > DEVIATION:
             return [f"{loud} is louder and {quiet} quieter than the noise that both share: --vary noise gives each its own"]
     return []
+
+
+def own_levels(found: StateSpaceFit) -> list[str]:
+    """Return what to try where the random friction field stands for a level of friction that each run has of its own.
+
+    Each run's mean field is taken for its level, and what is left for the field, as rough as before: variance over length cubed
+    stays. What the likelihood is there a fit with levels reaches or exceeds.
+    """
+    problem, states = found.likelihood.problem, found.likelihood.problem.model.states
+    if found.smooth or len(problem.runs) < 2 or "mu0" not in problem.names or "mu0" in problem.experiment.vary:
+        return []
+    point = found.likelihood.at(found.maximum.point.x, slopes=False, keep=True)
+    fields = {f.run.name: f.smoothed().mean[:, states.index("field")] for f in point.runs}
+    levels = {name: float(field.mean()) for name, field in fields.items()}
+    within, between = np.sqrt(np.mean([field.var() for field in fields.values()])), np.std(list(levels.values()))
+    if not within < between:
+        return []
+    experiment = replace(problem.experiment, vary={**problem.experiment.vary, "mu0": "run"})
+    listed = {q.name for q in problem.experiment.parameters}
+    free = [name for name in dict.fromkeys(n.partition("[")[0] for n in problem.names) if name in listed]
+    likelihood = found.likelihood.beside(
+        fit_problem(problem.model, experiment, free=free, trend=problem.trend, stability=problem.stability)
+    )
+    share, values = float(within / np.hypot(within, between)), found.values
+    values = values | {f"mu0[{name}]": values["mu0"] + level for name, level in levels.items()}
+    values |= {"field_amplitude": share * values["field_amplitude"], "field_length": share ** (2 / 3) * values["field_length"]}
+    gain = likelihood.at(likelihood.coordinates(values), slopes=False).log_likelihood - found.log_likelihood
+    if not gain > LEVEL_GAIN * (len(levels) - 1):
+        return []
+    told = ", ".join(f"{level:+.2g} in {name}" for name, level in list(levels.items())[:LEVELS_TOLD])
+    told += ", ..." if len(levels) > LEVELS_TOLD else ""
+    by = "" if experiment.by == "run" else ":run"
+    said = "most of the friction field is a level of each run's own"
+    return [f"{said} ({told}), which gains {gain:.0f} or more in log likelihood: --vary mu0{by}"]
 
 
 def coarse_readings(found: StateSpaceFit) -> list[str]:

@@ -346,7 +346,13 @@ class FitResult(Result):
         if found.friction_field is not None:
             notes.append(str(found.friction_field))
         notes += self.against
-        if self._field_share > WIDE[0][0]:
+        own: list[str] = []
+        if found.state_space is not None and found.status is not Status.INTERRUPTED:
+            from srfcli.diagnosis.goodness_of_fit import own_levels
+
+            own = own_levels(found.state_space)
+            notes += own
+        if self._field_share > WIDE[0][0] and not own:
             notes.append(
                 "under so wide a field a recording is followed whatever the parameters are, and the maximum may be a wrong one: "
                 "try --starts 5, or start values nearer to what is known"
