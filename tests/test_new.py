@@ -195,6 +195,9 @@ def test_a_stiffness_per_load_is_never_rescaled_in_silence(step: dict[str, np.nd
     said = srf("check", ".", "--no-simulate").stdout
     assert "0.04 MPa/um under 20 MPa in one" in drafted
     assert "0.04 MPa/um under 20 MPa in one, 0.08 MPa/um under 40 MPa in two; a machine's own stiffness does not grow" in said
+    assert "0.04 MPa/um under 20 MPa in one" in srf("simulate", ".", "--run", "one").stdout
+    row = srfcli.fit_campaign(["."], options={"track": "smooth", "free": ["mu0"]}).rows[0]
+    assert "0.04 MPa/um under 20 MPa in one" in row["flags"]
     text = Path("experiment.toml").read_text().replace("# K =", "K =")
     Path("experiment.toml").write_text(text.replace('upper = "0.004 1/um"', 'upper = "0.08 MPa/um"'))
     assert "a stiffness in MPa/um beside that of [apparatus], which is in 1/um" in srf("check", ".", code=2).stderr

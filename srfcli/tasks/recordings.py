@@ -744,6 +744,7 @@ def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
         yield "the maximum was not reached"
     yield from (f"{line[0]} {line[-1]}" for line in found.table.rows if line[-1])
     yield from found.against
+    yield from filter(None, [found.experiment.rescaled()])
     for name, scatter in found.found.scatter.items():
         apart = f", which scatter by {scatter.scatter / abs(scatter.mean):.0%} beyond their errors" if scatter else ""
         yield f"{name} is the mean of {len(found.found.problem.groups[name])} groups{apart}"

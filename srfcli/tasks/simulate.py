@@ -442,6 +442,7 @@ def runs_again(
     jobs = tuple(_job(model, experiment, run, values, start) for run in runs)
     unknown = [run.name for run in runs if run.initial == "free"]
     notes = (f"initial state of {', '.join(unknown)} not known: begun in steady sliding",) if unknown else ()
+    notes += () if "K" in values or not (told := experiment.rescaled()) else (told,)
     inputs = (experiment.path, *(run.file for run in runs))
     made = None if folder is None else _experiment_again(experiment, model, choice, values, folder, spread, seed)
     dropped = [p.name for p in experiment.parameters if p.name not in model.names]
