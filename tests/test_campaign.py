@@ -63,7 +63,8 @@ def test_a_row_for_each_experiment_and_a_reason_for_those_without_a_fit() -> Non
     assert (one["k"], rows["one"]["k_unit"], rows["one"]["k_stderr"]) == (pytest.approx(K * LOAD), "MPa/um", "")
     assert one["load"] == pytest.approx(LOAD) and one["rms_over_noise"] == pytest.approx(1.0, abs=0.15)
     # steady sliding at the end of a segment, and friction that goes on rising with slip
-    assert one["segments"] == one["steady"] == 1 and not rows["one"]["flags"]
+    assert one["segments"] == one["steady"] == 1
+    assert rows["one"]["flags"] == "1 of 2 segments is too short to say whether it ends in steady sliding"
     assert float(rows["drifts"]["final_slope"]) == pytest.approx(0.04, rel=0.2)
     assert "friction still changes with slip at the end of 1 of 1 segments" in rows["drifts"]["flags"]
 
@@ -94,6 +95,10 @@ def test_of_what_varies_a_row_has_the_mean_and_says_so() -> None:
     assert abs(B - TRUE["B"]) < 4 * float(row["B_stderr"]) < 0.4 * TRUE["B"]
     assert float(row["A_minus_B"]) == pytest.approx(A - B) and row["A_minus_B_stderr"] == ""
     assert "B is the mean of 2 groups" in row["flags"]
+    Path("one/experiment.toml").write_text(Path("one/experiment.toml").read_text().replace('vary = ["B"]', ""))
+    srf("fit", "one", "two", "--table", "asked.csv", "--track", "smooth", "--vary", "B", code=3)
+    asked = rows_of(Path("asked.csv"))
+    assert asked["one"]["B"] == row["B"] and "B cannot vary by run" in asked["two"]["reason"]
 
 
 def test_a_load_that_nobody_knows_is_not_stated() -> None:

@@ -169,7 +169,7 @@ def _fit_campaign(
     """Fit each experiment by itself, a row each; the table is written anew whenever one is done."""
     from srfcli.tasks.recordings import fit_campaign
 
-    _refuse(("profile", "sample", "draws", "vary", "by", "prior"), "one experiment")
+    _refuse(("profile", "sample", "draws"), "one experiment")
     target = None if place is None else Path(place).expanduser()
     if target is not None:
         if target.suffix.lower() != ".csv":
@@ -185,7 +185,10 @@ def _fit_campaign(
 
         found = fit_campaign(
             sources, reader=options["reader"], plugins=system.plugins, run=spread.run, done=done,
-            options={"free": free, "seed": options["seed"], **{k: options[k] for k in ("trend", "track", "starts")}},
+            options={
+                "free": free, "vary": listed(options["vary"]),
+                **{k: options[k] for k in ("trend", "by", "prior", "track", "starts", "seed")},
+            },
         )  # fmt: skip
     emit(
         found.table, output, seed=options["seed"], timings={"fit": progress.seconds}, figure=found.plot,

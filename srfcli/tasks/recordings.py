@@ -727,10 +727,16 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     row |= {"k": stated * factor, "k_unit": unit, "k_stderr": parameters["K"][1] if "K" in parameters else None}
     length = float(values.get("D0", 10.0))
     allowed = DRIFT * max(abs(values.get("A", 0.0)), abs(values.get("B", 0.0))) / length
-    found_slopes = [s for run in runs for s in _slopes(run, length)]
+    every = [s for run in runs for s in _slopes(run, length)]
+    found_slopes = [s for s in every if s is not None]
     steady = [not (abs(slope) > SURE * error and abs(slope) > allowed) for slope, error in found_slopes]
     sure = [slope for slope, error in found_slopes if abs(slope) > SURE * error]
-    row |= {"segments": len(steady), "steady": sum(steady), "final_slope": 1e3 * max(sure, key=abs) if sure else None}
+    row |= {
+        "segments": len(steady),
+        "short": len(every) - len(steady),
+        "steady": sum(steady),
+        "final_slope": 1e3 * max(sure, key=abs) if sure else None,
+    }
     row["flags"] = "; ".join(_flags(row, found))
     return row
 
@@ -752,17 +758,23 @@ def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
         yield f"friction still changes with slip at the end of {row['segments'] - row['steady']} of {row['segments']} segments"
     if not row["segments"]:
         yield "no segment is long enough to say whether it ends in steady sliding"
+    elif row["short"]:
+        which = "is too short to say whether it ends" if row["short"] == 1 else "are too short to say whether they end"
+        yield f"{row['short']} of {row['short'] + row['segments']} segments {which} in steady sliding"
     if row["rms_over_noise"] is not None and row["rms_over_noise"] > BAD_FIT:
         yield f"residual {row['rms_over_noise']:.2g} times the noise"
 
 
-def _slopes(run: Run, length: float) -> Iterator[tuple[float, float]]:
-    """Yield d mu/d slip (1/um) and its error for the end of each segment of constant velocity that is long enough."""
+def _slopes(run: Run, length: float) -> Iterator[tuple[float, float] | None]:
+    """Yield d mu/d slip (1/um) and its error for the end of each segment of constant velocity, None where it is too short."""
     mu = run.friction
     for begin, end in pairwise(run.edges):
         V, rate, _ = run.drive.piece(begin)
         part = (run.t >= end - STEADY_TAIL * (end - begin)) & (run.t <= end) & run.used
-        if rate or V <= 0 or V * STEADY_TAIL * (end - begin) < LONG_ENOUGH * length or part.sum() < 16:
+        if rate or V <= 0:
+            continue
+        if V * STEADY_TAIL * (end - begin) < LONG_ENOUGH * length or part.sum() < 16:
+            yield None
             continue
         x = V * (run.t[part] - run.t[part].mean())
         y = mu[part] - mu[part].mean()
