@@ -59,7 +59,7 @@ def found(columns: int, nearer: float) -> tuple[dict[str, list[float]], dict[str
     errors: dict[str, list[float]] = defaultdict(list)
     wrong: dict[str, int] = defaultdict(int)
     for kind, t, x, V, lasts, seen in drawn(columns):
-        drive, _ = imposed.drive_from_displacement(t, x, "column")
+        drive, *_ = imposed.drive_from_displacement(t, x, "column")
         ends = np.cumsum(lasts)
         at = np.array([drive.at(middle) for middle in ends - lasts / 2])
         error = float(np.max(np.abs(at / V - 1)))

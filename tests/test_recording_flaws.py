@@ -575,8 +575,9 @@ def test_a_step_of_the_written_figures_is_no_reset(jump: float, tmp_path: Path) 
     file.write_text("\n".join(["Time (s),Angle (deg),Normal stress (MPa),Torque (N m)", *rows]) + "\n")
     apparatus = ["--stiffness", "30 MPa/mm", "--radius", "25 mm", "--area", "1 cm^2"]
     assert CliRunner().invoke(cli, ["new", str(file), *apparatus, "--out", toml]).exit_code == 0
-    told = CliRunner().invoke(cli, ["check", toml, "--no-simulate"]).output
+    told = CliRunner().invoke(cli, ["check", toml, "--no-simulate", "--plot", str(tmp_path / "a.svg")]).output
     assert told.count("the displacement jumps by") == bool(jump)
+    assert ("displacement moved back, proposed" in (tmp_path / "a.svg").read_text(encoding="utf-8")) == bool(jump)
 
 
 @pytest.mark.parametrize(("noise", "count"), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)], ids=["clean", "noise", "encoder"])
@@ -596,7 +597,7 @@ def test_steps_that_are_many_or_short_beside_the_record(steps: list[tuple[float,
     t = np.arange(0.0, ends[-1], 0.1)
     displacements = np.interp(t, ends, way) + noise * np.random.default_rng(3).standard_normal(t.size)
     displacements = np.round(displacements / count) * count if count else displacements
-    drive, _ = drive_from_displacement(t, displacements, "stage")
+    drive, *_ = drive_from_displacement(t, displacements, "stage")
     assert drive.velocities == pytest.approx([V for _, V in steps], rel=2e-3)
     assert drive.breaks == pytest.approx(ends[1:-1], abs=0.1)
 
@@ -610,7 +611,7 @@ def test_holds_of_a_column_without_noise_are_its_drive(interval: float, count: f
         own = np.arange(0.0, duration - 1e-9, 0.1 if V else interval)
         t, x = [*t, *(at + own)], [*x, *(way + V * own)]
         at, way = at + duration, way + V * duration
-    drive, _ = drive_from_displacement(np.array(t), count * np.round(np.array(x) / count), "stage")
+    drive, *_ = drive_from_displacement(np.array(t), count * np.round(np.array(x) / count), "stage")
     assert np.allclose(drive.velocities, [10, 0, 10, 0, 10, 0, 10], atol=1e-3)
     assert np.allclose(drive.times, [0, 30, 60, 85, 205, 230, 530], atol=0.02)
 
@@ -625,7 +626,7 @@ def test_holds_of_a_noisy_column_of_velocities_stand_still() -> None:
 def test_counts_of_an_encoder_are_no_steps_of_the_drive() -> None:
     """A hundred samples to a count: each jump is the encoder's, and the misfit its rounding."""
     t = np.arange(0.0, 600.0, 0.1)
-    drive, told = drive_from_displacement(t, np.round(np.interp(t, [0, 300, 600], [0, 30, 120])), "stage")
+    drive, told, _ = drive_from_displacement(t, np.round(np.interp(t, [0, 300, 600], [0, 30, 120])), "stage")
     assert drive.velocities == pytest.approx([0.1, 0.3], rel=1e-3)
     assert "times their noise" not in told[-1].what
 
@@ -638,7 +639,7 @@ def test_a_motor_that_takes_half_a_second_to_its_next_velocity_ramps() -> None:
     fine = np.arange(0.0, 96.0, 1e-3)
     velocity = np.interp(fine, [0, 30, 30.5, 40.5, 41, 81, 81.5, 96], [3, 3, 30, 30, 3, 3, 9, 9])
     x = np.interp(t, fine, np.cumsum(velocity) * 1e-3) + rng.normal(0.0, 0.02, t.size)
-    drive, _ = drive_from_displacement(t, x, "stage")
+    drive, *_ = drive_from_displacement(t, x, "stage")
     told = x[0] + drive.displacement(t)
     assert np.abs(told - told.mean() - (x - x.mean())).max() < 0.5
 
@@ -651,7 +652,7 @@ def test_any_column_has_a_drive(seed: int) -> None:
     ends = np.concatenate([[0.0], np.cumsum(lasts)])
     t = np.arange(0.0, ends[-1], 0.01)
     x = np.round(np.interp(t, ends, np.concatenate([[0.0], np.cumsum(lasts * V)])) / 1.7) * 1.7
-    drive, _ = drive_from_displacement(t, x, "stage")
+    drive, *_ = drive_from_displacement(t, x, "stage")
     assert np.isfinite(drive.velocities).all()
 
 
@@ -660,7 +661,7 @@ def test_the_drive_of_a_crank_has_its_velocity(rate: int, noise: float) -> None:
     """A stroke of 100 um sin(wt), of which straight pieces make velocities that are 2 to 13 % of the largest off."""
     t, w = np.arange(0.2, 4.8, 1 / rate), 2 * np.pi / 10
     x = -100 * np.cos(w * t) + noise * np.random.default_rng(5).standard_normal(t.size)
-    drive, (notice,) = drive_from_displacement(t, x, "x")
+    drive, (notice,), _ = drive_from_displacement(t, x, "x")
     assert notice.kind == "drive-smoothed"
     assert np.std(drive(t) - 100 * w * np.sin(w * t)) < 0.005 * 100 * w
     moved = drive.displacement(t) + 100 * np.cos(w * t)
@@ -675,6 +676,6 @@ def test_steps_under_coloured_noise_stay_steps() -> None:
     for i in range(1, t.size):
         colour[i] = 0.97 * colour[i - 1] + 0.1 * rng.standard_normal()
     x = np.where(t < 10, 3 * t, 30 + 10 * (t - 10)) + colour
-    drive, notices = drive_from_displacement(t, x, "x")
+    drive, notices, _ = drive_from_displacement(t, x, "x")
     assert [n.kind for n in notices] == ["drive-fitted"]
     assert drive(np.array([2.0, 18.0])) == pytest.approx([3, 10], abs=0.2)

@@ -276,7 +276,7 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
             f"{run.node.where}: friction is recorded without a load, and the stiffness is in {apparatus.stated}",
             'Give the run load = "20 MPa", or the stiffness as friction per micron, in 1/um.',
         )
-    drive, told = drive_of(run, columns)
+    drive, told, resets = drive_of(run, columns)
     units = _units(run, columns, apparatus)
     load, weighed = load_of(run, columns, "MPa" if any(units.values()) else "N")
     check_start(run, drive, float(t[0]))
@@ -310,7 +310,7 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
         name=run.name, file=run.file, holdout=run.holdout, start=run.start, initial=run.initial, t=t, observed=observed,
         observable=role, used=used, drive=drive, load=load, stiffness=stiffness, modulation=run.modulation, quantum=quantum,
         notices=(), stress=any(units.values()), proposed=proposed, others=tuple(others), backward=run.backward,
-        segments=run.segments,
+        segments=run.segments, drive_resets=resets,
     )  # fmt: skip
     notices += [*told, *weighed, *flaws]
     if run.drive is None and columns.role("load_point_velocity") is not None:

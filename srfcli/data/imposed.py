@@ -28,15 +28,16 @@ from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation, Sampled
 DIFFERS = 0.05  # relative difference from a column that is told
 
 
-def drive_of(run: RunDescription, columns: Columns) -> tuple[Drive, list[Notice]]:
-    """Return the drive that a run declares, else that of its column, and what is to be told of it.
+def drive_of(run: RunDescription, columns: Columns) -> tuple[Drive, list[Notice], tuple[float, ...]]:
+    """Return the drive that a run declares, else that of its column, what is to be told of it, and when it may have been reset.
 
     Raises SrfError for a run that slides in both directions.
     """
     t, role = columns.seconds, columns.role(*DRIVES)
     if run.drive is not None:
         declared = declared_drive(run, columns, run.drive)
-        return declared, [] if role is None else drive_differs(declared, t, columns.arrays[role], columns.place(role).column)
+        told = [] if role is None else drive_differs(declared, t, columns.arrays[role], columns.place(role).column)
+        return declared, told, ()
     assert role is not None  # `read_columns` asks for one of the two
     values, where = columns.arrays[role], columns.place(role).column
     if found := strokes(columns):
@@ -48,7 +49,7 @@ def drive_of(run: RunDescription, columns: Columns) -> tuple[Drive, list[Notice]
             f'direction = "backward"; `srf new {run.file.name}` writes them.',
         )
     if role == "load_point_velocity":
-        return drive_from_velocity(t, values, where)
+        return *drive_from_velocity(t, values, where), ()
     channel = columns.channels[role]
     unit = channel.factor * channel.spec.scale
     steps = abs(unit) * written_steps(values / unit - channel.spec.offset / channel.spec.scale)
@@ -196,10 +197,11 @@ def written_steps(x: Array) -> Array:
 
 def drive_from_displacement(
     t: Array, X: Array, where: str, *, correct: bool = False, steps: Array | float = 0.0
-) -> tuple[Drive, list[Notice]]:
+) -> tuple[Drive, list[Notice], tuple[float, ...]]:
     """Return the drive in a column of displacements: the slopes of a continuous line of straight pieces through it.
 
-    With `correct` level jumps of the transducer are taken out. `steps` (n,) are those with which the numbers were written.
+    With `correct` level jumps of the transducer are taken out; else they are told, and the times (s) at which they begin
+    returned. `steps` (n,) are those with which the numbers were written.
     """
     known = np.isfinite(X)
     if known.sum() < 8:
@@ -242,7 +244,8 @@ def drive_from_displacement(
     if -way[back] > line.misfit:
         told = f"{-way[back]:.3g} um at t = {line.knots[back]:.7g} s"
         what += f"; it goes back by {told}: state the run's drive if the stage did not"
-    return drive, [*notices, Notice(kind, where, what)]
+    resets = () if correct else tuple(float(t[known][at]) for at, _ in line.jumps)
+    return drive, [*notices, Notice(kind, where, what)], resets
 
 
 def _bends(t: Array, X: Array, line: Line) -> bool:

@@ -83,7 +83,8 @@ class Run:
     `modulation` the declared frequency (Hz), relative amplitude, onset (s), and, if given, phase (deg) and rise (s), `quantum`
     the quantisation step, or 0.
     `others` are what was observed at the same times besides.
-    `proposed` is the observable as the corrections that are proposed would make it, None where there are none.
+    `proposed` is the observable as the corrections that are proposed would make it, None where there are none; `drive_resets`
+    are the times (s) at which the load point's displacement jumps, where it is proposed to take that out.
     `backward` where drive and observable count with the opposite sign, `segments` are the times (s) at which it may be cut.
     `stress` where stresses were recorded: a stress counts as the force on 1 mm^2, so that what is in N is in MPa.
     """
@@ -108,6 +109,7 @@ class Run:
     others: tuple[Signal, ...] = ()
     backward: bool = False
     segments: tuple[float, ...] = ()
+    drive_resets: tuple[float, ...] = ()
 
     @property
     def signals(self) -> tuple[Signal, ...]:

@@ -116,6 +116,11 @@ def _panel(axes: list[Axes], check: RunCheck) -> None:
             axis.axvspan(t[gap], t[gap + 1], color="#BBBBBB", alpha=0.5, linewidth=0)
     if run.proposed is not None:
         _proposed(axes[0], t, run.observed, run.proposed)
+    for number, at in enumerate(run.drive_resets):
+        name = None if number else "displacement moved back, proposed"
+        axes[1].axvline(at, color=plots.COLOURS[1], linestyle="--", linewidth=0.8, label=name)
+    if run.drive_resets:
+        axes[1].legend(loc="best", fontsize="small")
     for axis in axes:
         axis.ticklabel_format(axis="y", useOffset=False)
     imposed_scale(axes[1], V, wide=True)
