@@ -27,10 +27,16 @@ STEP = Drive.steps([(0.0, 1.0), (20.0, 10.0)])
 
 
 def moved(
-    effect: str, own: dict[str, float], *, drive: Drive = STEP, load: Load | None = None, end: float = 60.0
+    effect: str,
+    own: dict[str, float],
+    *,
+    drive: Drive = STEP,
+    load: Load | None = None,
+    end: float = 60.0,
+    ageing: str = "dieterich",
 ) -> tuple[GeneratedModel, np.ndarray, Motion]:
     """Return the model of a gouge with the effect, times (n,) in s and the motion from steady sliding at 1 um/s under 20 MPa."""
-    model = open_model(REGISTRY, law="dieterich-ruina", ageing="dieterich", interface="rigid", inertia=False, effects=(effect,))
+    model = open_model(REGISTRY, law="dieterich-ruina", ageing=ageing, interface="rigid", inertia=False, effects=(effect,))
     p = model.vector({**{k: v for k, v in GOUGE.items() if k in model.names}, **own})
     t = np.linspace(0.0, end, 601)
     motion = integrate(
@@ -137,8 +143,67 @@ def test_suction_is_the_change_of_age_undrained_and_nothing_drained() -> None:
     assert slope == pytest.approx(-1 / 5.0, rel=0.05)  # drains exponentially
 
 
+@pytest.mark.parametrize("ageing", ["dieterich", "ruina"])
+def test_a_layer_that_thins_settles_over_less_slip_at_every_step_and_as_high(ageing: str) -> None:
+    """At one velocity what is left of a step decays with the integral of slip over D0 h/h0: both laws have it in closed form."""
+    thinning, drive = 1e-3, Drive.steps([(0.0, 1.0), (20.0, 10.0), (100.0, 1.0), (250.0, 10.0)])
+    own = {"thinning": thinning, "K": 1e3}  # so stiff that the slider moves as the stage does
+    model, t, motion = moved("layer-thinning", own, drive=drive, end=300.0, ageing=ageing)
+    age = np.exp(state(model, motion, next(s for s in model.states if s.startswith("ln_") and s != "ln_v")))
+    slip = state(model, motion, "slip")
+    assert slip[-1] == pytest.approx(20 + 800 + 150 + 500, abs=0.1)
+    for begin, end, V in ((20.0, 100.0, 10.0), (250.0, 300.0, 10.0)):
+        first, last = (int(np.argmin(np.abs(t - at))) for at in (begin + 1.0, end))
+        part = slice(first, last)
+        left = age * V / 10.0 - 1 if ageing == "dieterich" else np.log(age * V / 10.0)
+        slid = (np.exp(thinning * slip) - np.exp(thinning * slip[first])) / (thinning * 10.0)
+        assert left[part] == pytest.approx((left[first] * np.exp(-slid))[part], rel=0.02, abs=2e-3)
+    assert age[-1] == pytest.approx(10.0 / 10.0, rel=1e-3)
+
+
+PLAY = """format = "srf-experiment/1"
+[apparatus]
+stiffness = "0.1 N/um"
+[model]
+law = "dieterich-ruina"
+ageing = "dieterich"
+interface = "rigid"
+inertia = false
+effects = ["backlash"]
+[parameters]
+mu0 = { value = 0.6, lower = 0.3, upper = 0.9 }
+A = { value = 0.009, fixed = true }
+B = { value = 0.006, fixed = true }
+D0 = { value = 10.0, fixed = true }
+V0 = { value = 1.0, fixed = true }
+play = { value = 22.0 }
+[[runs]]
+name = "a"
+file = "a.csv"
+"""
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
+def test_a_drive_with_play_is_one_that_begins_late(tmp_path: Path) -> None:
+    play, after = 30.0, Drive.steps([(0.0, 0.0), (3.0, 10.0)])
+    own = {"play": play, "rounding": 0.1, "V": 10.0}
+    model, t, motion = moved("backlash", own, drive=Drive.constant(10.0), end=30.0)
+    late, _, begun = moved("backlash", {**own, "play": 0.0}, drive=after, end=30.0)
+    ones, p = np.ones_like(t), late.vector({**GOUGE, "play": 0.0})
+    u = np.asarray(late.elongation(begun.x, after(t), 20 * ones, 0 * ones, p))
+    p = model.vector({**GOUGE, **own})
+    found = np.asarray(model.elongation(motion.x, 10 * ones, 20 * ones, 0 * ones, p))
+    assert found == pytest.approx(u, abs=0.1) and np.ptp(u) > 1.0
+    rows = [f"{a:.2f},10,20,{0.1 * b:.6f}" for a, b in zip(t, u + np.random.default_rng(1).normal(0, 0.05, t.size), strict=True)]
+    head = "time [s],load_point_velocity [um/s],normal_load [N],force [N]"
+    (tmp_path / "a.csv").write_text("\n".join([head, *rows]))
+    (tmp_path / "experiment.toml").write_text(PLAY)
+    fit = fit_recordings(REGISTRY, read_experiment(tmp_path, registry=REGISTRY)).fit
+    assert fit.values["play"] == pytest.approx(play, abs=0.4)
+
+
 def test_they_are_searched_for_only_where_they_are_named() -> None:
-    named = ("slip-hardening", "frictional-heating", "rate-cutoff", "load-lag", "dilatancy")
+    named = ("slip-hardening", "frictional-heating", "rate-cutoff", "load-lag", "dilatancy", "layer-thinning", "backlash")
     for name in (*named, "load-servo", "pore-pressure", "gauge-creep"):
         assert REGISTRY.get("effect", name).on_request  # type: ignore[union-attr]
     assert not REGISTRY.get("effect", "second-state").on_request  # type: ignore[union-attr]
