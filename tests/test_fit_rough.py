@@ -105,6 +105,26 @@ def test_parameters_are_those_concealed_within_their_errors(fitted):
         assert abs(row["value"] - getattr(truth, row["parameter"])) < 3.5 * row["stderr"], row
 
 
+def test_the_field_of_a_gouge_is_as_long_as_its_slip_wants(tmp_path):
+    """Twenty times as long as a slider's in all that is a length: slip, D0, noise of the gauge and the field itself."""
+    gouge = replace(PLAIN, D0=20 * PLAIN.D0, V0=20.0, Vsat=20 * PLAIN.Vsat, K=PLAIN.K / 20)
+    track, rng = Track(2e-3, 120.0, 3), np.random.default_rng(5)
+    plans = [replace(q, drive=tuple((t, 20 * V) for t, V in q.drive)) for q in PLANS]
+    readings = {q: read_gauge(move(replace(gouge, track=track), q).u, Gauge(sigma=0.4, quantum=0.1), rng) for q in plans}
+    for name, text in case_files("gouge", gouge, readings).items():
+        text = text.replace("0.4, lower = 0.1, upper = 1.5", "8.0, lower = 2.0, upper = 30.0")
+        text = text.replace("V0 = { value = 1.0", "V0 = { value = 20.0").replace(
+            "280.0, lower = 50.0, upper = 2000.0", "5600.0, lower = 1e3, upper = 4e4"
+        )
+        (tmp_path / name).write_text(text)
+    done = CliRunner().invoke(cli, ["fit", str(tmp_path), "--free", "mu0,A,B", "--track", "shared", "--json"])
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)["meta"]
+    assert found["track"]["shared"] and 40.0 < found["track"]["length_um"] < 300.0
+    assert 1e-3 < found["track"]["amplitude"] < 4e-3
+    assert found["rms_over_noise"]["fit"] < 1.15 and found["rms_over_noise"]["holdout"] < 1.15
+
+
 @pytest.fixture(scope="module")
 def offset(tmp_path_factory):
     """Three runs under two loads whose mu0 are apart by 2e-3 and -1e-3, one more held out; everything else is alike."""

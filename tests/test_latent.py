@@ -16,6 +16,9 @@ from srfcli.inference.recordings import fit_recordings
 from srfcli.inference.shared_field import AMPLITUDES, LENGTHS, FieldPrior, marginal
 from srfcli.laws.registry import load_registry
 
+Grid = tuple[np.ndarray, np.ndarray]
+GRID = (120 * LENGTHS, AMPLITUDES)  # on a track of 120 um
+
 
 def test_prior_is_the_matern_covariance() -> None:
     nodes = np.linspace(0.0, 12.0, 25)
@@ -30,7 +33,7 @@ def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.nda
     track = Spline.over(0.0, 30.0, 0.8)
     n, m = 400, track.coefficients.size
     J, C = rng.normal(size=(n, 2)), 2e4 * BSpline.design_matrix(np.linspace(0, 30, n), knots(track), 3).toarray()
-    c = FieldPrior(amplitude, LENGTHS[1]).root(track.nodes) @ rng.normal(size=m) if amplitude else np.zeros(m)
+    c = FieldPrior(amplitude, 120 * LENGTHS[1]).root(track.nodes) @ rng.normal(size=m) if amplitude else np.zeros(m)
     return J @ [1.0, -2.0] + C @ c + rng.normal(size=n), J, C, track
 
 
@@ -44,15 +47,15 @@ def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, field: Fi
     return flat - 0.5 * float(rest @ np.linalg.solve(S, rest)) - 0.5 * np.linalg.slogdet(S)[1]
 
 
-def _marginal(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, **grid: object) -> tuple[float, FieldPrior]:
+def _marginal(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, grid: Grid = GRID) -> tuple[float, FieldPrior]:
     A = np.column_stack([J, C])
-    return marginal(A.T @ A, A.T @ r, 2, track, -0.5 * float(r @ r), **grid)
+    return marginal(A.T @ A, A.T @ r, 2, track, -0.5 * float(r @ r), grid)
 
 
 def test_marginal_likelihood_is_that_of_the_whole_covariance() -> None:
     problem = _linear(1e-4, 1)
     found, field = _marginal(*problem)
-    best = max(_whole(*problem, FieldPrior(a, length)) for length in LENGTHS for a in AMPLITUDES)
+    best = max(_whole(*problem, FieldPrior(a, length)) for length in GRID[0] for a in AMPLITUDES)
     assert found == pytest.approx(best, abs=1e-5)
     assert 0.3e-4 < field.amplitude < 3e-4
 
@@ -60,7 +63,7 @@ def test_marginal_likelihood_is_that_of_the_whole_covariance() -> None:
 @pytest.mark.parametrize("own", [FieldPrior(5e-4, 6.0), FieldPrior(2e-5, 0.5)], ids=["coarse", "finer than its knots"])
 def test_marginal_likelihood_of_one_field_is_its_own_and_not_a_better_one_s(own: FieldPrior) -> None:
     problem = _linear(1e-4, 1)
-    found = _marginal(*problem, grid=(np.array([own.length]), np.array([own.amplitude])))
+    found = _marginal(*problem, (np.array([own.length]), np.array([own.amplitude])))
     assert found == (pytest.approx(_whole(*problem, own), abs=1e-5), own)
 
 

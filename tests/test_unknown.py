@@ -14,6 +14,7 @@ from srfcli.cli.main import cli
 from srfcli.codegen.model import open_model
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
+from srfcli.data.scales import at_scale
 from srfcli.diagnosis.discrepancy import (
     TERMS_FOLDER,
     ClosedForm,
@@ -97,6 +98,21 @@ def test_terms_have_parameters_of_their_own():
     """Several are in one model: a name that two of them had would be renamed, and a fit's values with it."""
     names = [p.name for path in TERMS for p in read_law(path).parameters]
     assert len(TERMS) >= 20 and len(names) == len(set(names))
+
+
+def test_terms_have_the_scales_of_a_recording():
+    """Of a gouge: a hundred times a slider's slip and time, ten times its interval."""
+    scales = {"track": 12e3, "segment": 6e3, "duration": 850.0, "interval": 0.01, "D0": 40.0, "load": 20.0}
+    moved = {p.name: p for path in TERMS for p in at_scale(read_law(path), scales).parameters}
+    assert (moved["place"].lower, moved["place"].upper) == (0.0, 12e3)
+    for name, low, high in (
+        ("place_width", 40, 1500),
+        ("settling_time", 10, 2975),
+        ("run_length", 100, 20400),
+        ("age_loss", 0, 0.2),
+    ):
+        assert (moved[name].lower, moved[name].upper) == pytest.approx((low, high))
+    assert moved["drive_delay"].upper == moved["load_delay"].upper == pytest.approx(106.25)
 
 
 def test_terms_join_the_registry_and_give_way_to_a_registered_effect():

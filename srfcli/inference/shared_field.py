@@ -16,16 +16,16 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.codegen.splines import Spline
 from srfcli.core.errors import Status
+from srfcli.data.scales import scales_of
 from srfcli.data.values import Run
 from srfcli.inference.fit import Fit, Problem, RunFit, inverse, solve_scaled
 from srfcli.inference.noise import Noise, difference_level, estimate_noise, log_determinant, stretches, whiten
 from srfcli.inference.prediction import Prediction, predict
 
-KNOT_SPACING = 0.8  # um between knots: contacts are renewed over half of it, and a finer track fits no better
+KNOTS = 150  # in the longest slip of a run: 0.8 um of a slider's 120, over half of which contacts are renewed
 MOST_KNOTS = 300  # coefficients of a track: a longer one has wider knots
 AMPLITUDES = np.array([0.0, *np.geomspace(2e-5, 3e-3, 12)])
-LENGTHS = np.geomspace(1.0, 30.0, 6)
-GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the field that are tried
+LENGTHS = np.geomspace(1 / 120, 1 / 4, 6)  # of the field that are tried, over the longest slip of a run
 FIELD_ROUNDS = 4  # of field, parameters and noise in turn
 ROUNDS_AGREE = 0.5  # in log likelihood, between two rounds that agree
 MOST_STEPS = 25
@@ -51,7 +51,7 @@ class FieldPrior:
         return self.amplitude * np.linalg.cholesky(K)
 
 
-USUAL = FieldPrior(3e-4, 8.0)  # of a track until its own is estimated: polished contacts wander by so much
+USUAL = FieldPrior(3e-4, 1 / 15)  # until its own is estimated: polished contacts wander by so much; over the longest slip
 
 
 def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] = lambda text: None) -> tuple[Fit, FieldPrior]:
@@ -63,7 +63,7 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
     progress("one random friction field for all runs")
     likelihood, noise = SharedLikelihood(problem), {r.name: Noise(r.noise.level) for r in begun.runs if not r.holdout}
     theta = np.array([begun.values[name] for name in problem.names])
-    point, before = likelihood.at(theta, _track(problem.runs), noise, FieldPrior()), -np.inf
+    point, before = likelihood.at(theta, _track(problem.runs, likelihood.slip), noise, FieldPrior()), -np.inf
     for number in range(FIELD_ROUNDS):
         point = replace(point, prior=likelihood.prior(point))
         if not point.prior.amplitude:
@@ -72,7 +72,7 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
         noise = likelihood.noise(point)
         point = likelihood.at(point.theta, point.track, noise, point.prior)
         own = np.array([point.prior.length]), np.array([point.prior.amplitude])
-        attained = marginal(point.N, point.g, theta.size, point.track, point.log_likelihood, grid=own)[0]
+        attained = marginal(point.N, point.g, theta.size, point.track, point.log_likelihood, own)[0]
         total = min(attained, point.log_likelihood)  # no prior adds any
         if abs(total - before) < ROUNDS_AGREE:
             break
@@ -85,10 +85,11 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
     return fitted, point.prior
 
 
-def _track(runs: Sequence[Run]) -> Spline:
-    """Return a smooth track that covers the slip of these runs."""
+def _track(runs: Sequence[Run], slip: float) -> Spline:
+    """Return a smooth track that covers the slip of these runs, the longest of which is `slip`."""
     low, high = min(r.start for r in runs), max(r.start + float(r.drive.displacement(r.t)[-1]) for r in runs)
-    return Spline.over(low - 1.0, high + 2.0, max(KNOT_SPACING, (high - low) / (MOST_KNOTS - 3)))
+    spacing = max(slip / KNOTS, (high - low) / (MOST_KNOTS - 6))
+    return Spline.over(low - spacing, high + 2 * spacing, spacing)
 
 
 def _judged(likelihood: SharedLikelihood, point: Point, name: str) -> RunFit:
@@ -129,6 +130,8 @@ class SharedLikelihood:
         self.problem = problem
         self.scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
         self.evaluations = 0
+        self.slip = max(scales_of(problem.runs, ()).get("track", 0.0), 1e-6)  # longest of a run, um
+        self.grid = self.slip * LENGTHS, AMPLITUDES
         self.samples = sum(int(run.used.sum()) for run in problem.runs)
 
     def predicted(self, run: Run, theta: Array, track: Spline, *, slopes: bool = True) -> Prediction:
@@ -199,8 +202,8 @@ class SharedLikelihood:
     def prior(self, point: Point) -> FieldPrior:
         """Return the field at which the marginal likelihood is largest, the one so far where that means nothing."""
         if point.chi2 > ROUGHLY * self.samples:
-            return point.prior if point.prior.amplitude else USUAL
-        return marginal(point.N, point.g, point.theta.size, point.track, point.log_likelihood)[1]
+            return point.prior if point.prior.amplitude else replace(USUAL, length=self.slip * USUAL.length)
+        return marginal(point.N, point.g, point.theta.size, point.track, point.log_likelihood, self.grid)[1]
 
     def _step(self, point: Point, L: Array, free: Array, damping: float) -> tuple[Array, float]:
         """Return the step over (scaled theta, numbers), and what it should gain in minus twice the log posterior."""
@@ -240,9 +243,9 @@ class SharedLikelihood:
 
 
 def marginal(
-    N: Array, g: Array, n: int, track: Spline, log_likelihood: float, *, grid: tuple[Array, Array] = GRID
+    N: Array, g: Array, n: int, track: Spline, log_likelihood: float, grid: tuple[Array, Array]
 ) -> tuple[float, FieldPrior]:
-    """Return the largest marginal likelihood over amplitude and length, and where, from normal equations at `track`.
+    """Return the largest marginal likelihood over a grid of lengths and amplitudes, and where, from normal equations at `track`.
 
     The first n columns are those of flat parameters, the others those of the track; `log_likelihood` is that of the residuals.
     """
