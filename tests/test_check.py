@@ -19,7 +19,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from srfcli.codegen.model import open_model
 from srfcli.data.experiment import check_run, read_experiment
-from srfcli.data.gauge import GaugeNoise, with_slower
+from srfcli.data.gauge import GaugeNoise, of_one_gauge
+from srfcli.data.noise import ar1
 from srfcli.data.values import Experiment, FitParameter
 from srfcli.inference.cramer_rao import CramerRaoBound, Forecast, forecast
 from srfcli.inference.fit import fit_problem
@@ -229,6 +230,49 @@ def test_a_constant_load_cannot_tell_alpha(shared: Path) -> None:
     assert "changes the age) cannot be identified: no fitted run has a load that changes" in text
 
 
+HELD = """format = "srf-experiment/1"
+[apparatus]
+stiffness = "3e-3 1/um"
+[model]
+law = "dieterich-ruina"
+ageing = "ruina"
+interface = "rigid"
+inertia = false
+[parameters]
+mu0 = { value = 0.6, lower = 0.3, upper = 0.9 }
+D0 = { value = 20.0, lower = 1.0, upper = 100.0 }
+V0 = { value = 10.0, fixed = true }
+[[runs]]
+name = "steps"
+file = "steps.csv"
+"""
+
+
+@pytest.mark.parametrize("eps", [0.0, 0.01], ids=["held", "modulated"])
+def test_noise_of_a_load_cell_tells_nothing_of_alpha(eps: float, tmp_path: Path) -> None:
+    """Coloured, it stays in the spline through the load, and its slopes look like changes of the load."""
+    rng, t = np.random.default_rng(1), np.arange(0.0, 20.0, 0.01)
+    W = 20 * (1 + eps * np.sin(np.pi * t)) + 0.02 * ar1(t.size, 0.9, rng=rng) + rng.normal(0, 0.005, t.size)
+    tau = 12 + rng.normal(0, 0.002, t.size)
+    rows = [f"{a:.2f},{10 if a < 10 else 30},{b:.5f},{c:.5f}" for a, b, c in zip(t, tau, W, strict=True)]
+    (tmp_path / "steps.csv").write_text("\n".join(["time,load_point_velocity,shear_stress,normal_stress", *rows]) + "\n")
+    (tmp_path / "experiment.toml").write_text(HELD)
+    done = json.loads(srf("check", str(tmp_path), "--json").stdout)
+    found = done["meta"]["runs"][0]["tells"]
+    assert found["variation"] > 2e-3
+    held = any("the load is only held in steps" in note for note in done["notes"])
+    assert held is not bool(eps) and (found["errors"]["alpha"] is None) is held
+
+
+def test_a_short_part_has_the_noise_of_its_recording() -> None:
+    """Of 64 samples at a step one line is a signal; what is usual at the rate, and at a slower one, holds there, too."""
+    line = GaugeNoise(0.002, colours=((4.7, 0.04, 3.0),), samples=2000, stretch=2.5)
+    short, fast = GaugeNoise(0.0016, samples=64, stretch=0.6), GaugeNoise(0.001, samples=6000, stretch=0.25)
+    recorded = [(0.01, line), (0.01, line), (0.0101, short), (0.001, fast)]
+    assert of_one_gauge({0.01: short, 0.001: fast}, recorded) == (line, replace(fast, colours=line.colours))
+    assert of_one_gauge({0.01: short}, [(0.01, line), (0.01, short)]) == (short,)  # two do not say what is usual
+
+
 def test_bounds_and_free_starts_cost_what_they_must(made: Path) -> None:
     experiment = read_experiment(made, registry=REGISTRY)
     experiment = replace(experiment, runs=experiment.runs[:1])
@@ -323,6 +367,10 @@ def test_a_fast_stretch_has_the_slow_noise_that_another_rate_shows() -> None:
     fast = GaugeNoise(1e-3, colours=((60.0, 2e-3, 3.0),), samples=9000, stretch=0.25)
     slow = GaugeNoise(1e-3, colours=((4.6, 0.04, 3.0), (20.0, 3e-3, 2.0), (0.5, 0.01), (0.1, 0.02)), samples=900, stretch=2.5)
     few = GaugeNoise(1e-3, colours=((1.0, 9.0),), samples=90, stretch=6.4)
-    assert [n.colours for n in with_slower((fast, slow))] == [(*fast.colours, slow.colours[0], slow.colours[2]), slow.colours]
-    assert with_slower((fast, slow, few))[1].colours == slow.colours
-    assert with_slower((slow,)) == (slow,)
+    own = {0.001: fast, 0.01: slow}
+    assert [n.colours for n in of_one_gauge(own, [*own.items()])] == [
+        (*fast.colours, slow.colours[0], slow.colours[2]),
+        slow.colours,
+    ]
+    assert of_one_gauge(own, [*own.items(), (0.1, few)])[1].colours == slow.colours
+    assert of_one_gauge({0.01: slow}, [(0.01, slow)]) == (slow,)

@@ -8,7 +8,7 @@ bias the result. One evaluation is a product with a matrix, however long the rec
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
@@ -38,6 +38,9 @@ ENOUGH_STRETCHES = 4  # stretches; if there are more, some may be rejected
 REJECTED_SHARE = 1e-3  # share of stretches of pure noise that are rejected
 CALM_ROUNDS = 4  # in which the calm stretches are chosen anew
 INDEPENDENT_POWERS = 1.94  # powers over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
+SAME_RATE = 0.1  # in the logarithm of the spacing
+FEWEST_PARTS = 3  # of a recording at one rate, that say what noise is usual there
+QUIET = 3.0  # times less than the usual noise, from where on a part tells nothing of it
 WHITE = 1e-3  # standard deviation of each part over that of the whole noise, at least
 LEAST_DEVIATION = 1e-150  # standard deviation whose square is still a number
 
@@ -162,14 +165,18 @@ def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t
     return out
 
 
-def with_slower(noises: Sequence[GaugeNoise]) -> tuple[GaugeNoise, ...]:
-    """Return the noise of each sampling rate with the slower processes that another shows, over longer stretches.
+def of_one_gauge(own: Mapping[float, GaugeNoise], recorded: Sequence[tuple[float, GaugeNoise]]) -> tuple[GaugeNoise, ...]:
+    """Return the noises of a part of a recording, by spacing (s), with what all parts, `recorded`, show of their one gauge.
 
-    One gauge has them at every rate; at a fast one stretches may be too short to tell them from a trend.
+    A part far quieter than is usual at its rate is short: what it holds of the noise was taken for signal. Slower processes are
+    those that another rate or part shows over longer stretches; in shorter ones they are not told from a trend.
     """
     found = []
-    for noise in noises:
-        longer = [other for other in noises if other.stretch > noise.stretch]
+    for spacing, noise in own.items():
+        alike = sorted((n for dt, n in recorded if abs(np.log(dt / spacing)) < SAME_RATE), key=lambda n: n.total)
+        if len(alike) >= FEWEST_PARTS and noise.total < alike[len(alike) // 2].total / QUIET:
+            noise = alike[len(alike) // 2]
+        longer = [other for _, other in recorded if other.stretch > noise.stretch]
         seen = max(longer, key=lambda other: other.samples, default=noise)
         slow = [c for c in seen.colours if not _resolved(c, noise.stretch)]
         found.append(replace(noise, colours=(*noise.colours, *slow)))

@@ -7,6 +7,9 @@ error is the Cramer-Rao bound with the experiment's free parameters unknown with
 does not know either: the machine's stiffness, within a factor of two, and a trend of each run with slip. The noise's level and
 colour may be unknown, too: of Gaussian noise their information and that of the mean are apart, so that it costs nothing. A fit
 of these recordings by this model cannot do better. A random friction field, or start values that are far off, make it worse.
+
+A recorded load that varies no more than its own gauge's noise, or than a load cell drifts, is constant here: such changes are no
+known changes of the load.
 """
 
 from __future__ import annotations
@@ -23,11 +26,12 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import to_base
 from srfcli.data.clock import Mask
 from srfcli.data.experiment import RunCheck
-from srfcli.data.gauge import whiten, with_slower
+from srfcli.data.gauge import COLOUR_SAMPLES, find_noise, of_one_gauge, whiten
 from srfcli.data.values import Experiment, ModelChoice
 from srfcli.inference.fit import solve_scaled
 from srfcli.inference.prediction import own_names, own_start, predict, run_parameters, stiffness_share
 from srfcli.laws.registry import Registry
+from srfcli.motion.imposed import ConstantLoad, SampledLoad, runs_of
 
 MODIFIER = "linker-dieterich"
 SIZES = {"alpha": 0.2, "lambda": 0.1, "n": 0.1}  # that one would want to see: of rock's alpha, of lambda's own value, of n
@@ -35,6 +39,9 @@ OTHER_MOTION = 3.0  # rms of simulation minus recording over the recording's own
 STIFFER = 1.5  # from half to twice the stated stiffness
 MOST_SIMULATED = 20_000  # samples of a run that are simulated
 NOISE_BLOCK = 16  # samples of one: the first half tells what the noise is like there, the second half counts
+HELD = (2.0, 30.0)  # times its gauge's noise: standard deviation and range of a load that is only held
+CELL_DRIFT = 3e-4  # of the load: standard deviation of a load cell's own drift
+MOST_NOISE = 0.01  # of the load: what is more is no gauge's noise
 UNDETERMINED = 100.0  # an error beyond this tells nothing: alpha and n are of order 1, lambda counts relative to itself
 
 
@@ -42,9 +49,10 @@ UNDETERMINED = 100.0  # an error beyond this tells nothing: alpha and n are of o
 class CramerRaoBound:
     """Smallest errors of alpha, lambda (relative) and n, by these names, from one run or several: inf where nothing is told.
 
-    What the model does not have is missing. `peaks` are the largest changes that SIZES make and nothing else can, over the
-    noise of a sample. `variation` is the range of ln W; `misfit` is simulation minus recording over the recording's spread (rms);
-    `status` and `reached` (s) say how far the simulation went.
+    What the model does not have is missing. `held` where the load varies no more than its gauge does, and counts as constant.
+    `peaks` are the largest changes that SIZES make and nothing else can, over the noise of a sample. `variation` is the range of
+    ln W; `misfit` is simulation minus recording over the recording's spread (rms); `status` and `reached` (s) say how far the
+    simulation went.
     """
 
     name: str
@@ -55,6 +63,7 @@ class CramerRaoBound:
     misfit: float = 0.0
     status: Status = Status.OK
     reached: float = math.inf
+    held: bool = False
 
     @property
     def believed(self) -> bool:
@@ -110,10 +119,15 @@ def forecast(
     runs, fitted = [], []
     for check in checks:
         progress(check.run.name)
-        told = _simulated(question, check, most)
+        parts = [c for c in checks if (c.run.file, c.run.observable) == (check.run.file, check.run.observable)]
+        recorded = [pair for c in parts for pair in zip(c.run.sampling.spacings, c.noises, strict=True)]
+        noises = of_one_gauge(dict(zip(check.run.sampling.spacings, check.noises, strict=True)), recorded)
+        held = is_held(check)
+        run = replace(check.run, load=ConstantLoad(check.load.mean)) if held else check.run
+        told = _simulated(question, replace(check, run=run, noises=noises), most)
         errors, peaks = _errors(question, [told])
         name, holdout = check.run.name, check.run.holdout
-        one = CramerRaoBound(name, holdout, _variation([check]), errors, peaks, told.misfit, told.status, told.reached)
+        one = CramerRaoBound(name, holdout, _variation([check]), errors, peaks, told.misfit, told.status, told.reached, held)
         runs.append(one)
         if one.believed and not holdout:
             fitted.append((check, told))
@@ -125,6 +139,28 @@ def forecast(
     errors, peaks = _errors(question, [told for _, told in fitted])
     together = CramerRaoBound("all fitted runs", False, _variation([check for check, _ in fitted]), errors, peaks)
     return Forecast(tuple(runs), together, free)
+
+
+def is_held(check: RunCheck) -> bool:
+    """Return whether a recorded load is only held: at every sampling rate it varies no more than its gauge's noise or drift.
+
+    Noise is what is left in stretches after a parabola and a modulation: white, coloured, lines of the mains.
+    """
+    run, mean, modulation = check.run, check.load.mean, check.load.modulation
+    if not isinstance(run.load, SampledLoad) or run.modulation is not None:
+        return False
+    W, raw = run.load(run.t)[0], np.interp(run.t, run.load.times, run.load.W)
+    for k, dt in enumerate(run.sampling.spacings):
+        parts = [slice(a, b + 1) for a, b in runs_of(run.sampling.at == k)]
+        own = np.concatenate([W[part] for part in parts])
+        if modulation is None and own.std() <= CELL_DRIFT * mean:
+            continue
+        if max(part.stop - part.start for part in parts) < COLOUR_SAMPLES:
+            return False
+        noise = find_noise([raw[part] for part in parts], dt, cycles=modulation.frequency * dt if modulation else None).total
+        if not (noise <= MOST_NOISE * mean and own.std() <= HELD[0] * noise and np.ptp(own) <= HELD[1] * noise):
+            return False
+    return True
 
 
 def _variation(checks: Sequence[RunCheck]) -> float:
@@ -231,7 +267,7 @@ def innovations(check: RunCheck, chosen: NDArray[np.int64], J: Array, used: Mask
         place = np.arange(chosen.size) % NOISE_BLOCK
         begins, counts = begins | (place == 0), used & (place >= NOISE_BLOCK // 2)
     begins = np.diff(np.cumsum(begins)[used], prepend=-1) > 0  # a beginning that is not used passes to the next sample that is
-    white = whiten(with_slower(check.noises), at[used], begins, t[used], J[used])
+    white = whiten(check.noises, at[used], begins, t[used], J[used])
     return np.asarray(math.sqrt(weight) * white[counts[used]])
 
 

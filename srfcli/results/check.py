@@ -342,6 +342,8 @@ def sentences(forecast: Forecast) -> list[str]:
     """Return sentences on what the loads can identify: runs of constant load, each parameter, and the assumptions."""
     constant = [r.name for r in forecast.runs if r.variation < CONSTANT]
     told = [f"the load is constant in {joined(constant)}"] if constant else []
+    if held := [r.name for r in forecast.runs if r.held]:
+        told.append(f"the load is only held in {joined(held)}: it varies no more than its gauge does, and counts as constant")
     told += [_not_believed(r) for r in forecast.runs if not r.believed or not r.status.ok]
     judge = forecast.together or next((r for r in forecast.runs if r.believed), None)
     if judge is None:
@@ -365,7 +367,8 @@ def _not_believed(told: CramerRaoBound) -> str:
 
 
 def _sentence(name: str, judge: CramerRaoBound, forecast: Forecast) -> str:
-    error, varied = judge.errors[name], any(r.variation >= CONSTANT and not r.holdout for r in forecast.runs)
+    error = judge.errors[name]
+    varied = any(r.variation >= CONSTANT and not (r.held or r.holdout) for r in forecast.runs)
     if name == "alpha" and not varied:
         return f"{SUBJECTS[name]} cannot be identified: no fitted run has a load that changes"
     if math.isinf(error):

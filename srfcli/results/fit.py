@@ -26,7 +26,7 @@ from srfcli.inference.state_space import WIDE, typical_friction
 from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
 from srfcli.results.figures import draw_loads, stacked
-from srfcli.results.report_text import bracketed, unit_text, with_unit
+from srfcli.results.report_text import bracketed, joined, unit_text, with_unit
 from srfcli.results.tables import STATUS, Column, Result, Table, cell_text
 
 if TYPE_CHECKING:
@@ -517,12 +517,15 @@ def posterior_notes(posterior: Posterior) -> list[str]:
 
 
 def flag(fit: Fit, k: int) -> str:
-    """Return what stands against an estimate: at a bound, sought no further, not determined, or tied to another parameter."""
+    """Return what stands against an estimate: at a bound, sought no further, not determined, tied to another, others at bounds.
+
+    With a parameter at a bound the errors of the others are those with that parameter known.
+    """
     name = fit.names[k]
     width = fit.upper[k] - fit.lower[k]
     if math.isinf(fit.stderr[name]):
         return "not identifiable: the recordings have no say in it"
-    if min(fit.values[name] - fit.lower[k], fit.upper[k] - fit.values[name]) < NEAR_BOUND * width:
+    if _at_bound(fit, k):
         return "at its lower bound" if fit.values[name] - fit.lower[k] < NEAR_BOUND * width else "at its upper bound"
     if fit.status is Status.INTERRUPTED:
         return "not at the maximum: the fit was interrupted"
@@ -531,7 +534,15 @@ def flag(fit: Fit, k: int) -> str:
     tied = np.nan_to_num(np.abs(fit.correlation[k]))  # NaN with one at a bound
     tied[k] = 0
     other = int(np.argmax(tied)) if tied.size > 1 else k
-    return f"tied to {fit.names[other]}: correlation {fit.correlation[k][other]:.3f}" if tied[other] > TIED else ""
+    if tied[other] > TIED:
+        return f"tied to {fit.names[other]}: correlation {fit.correlation[k][other]:.3f}"
+    bound = [other for i, other in enumerate(fit.names) if _at_bound(fit, i)]
+    return f"error with {joined(bound)} held at {'a bound' if len(bound) == 1 else 'bounds'}" if bound else ""
+
+
+def _at_bound(fit: Fit, k: int) -> bool:
+    value, low, high = fit.values[fit.names[k]], fit.lower[k], fit.upper[k]
+    return min(value - low, high - value) < NEAR_BOUND * (high - low)
 
 
 # A fit of critical loads alone, as in the paper: each method beside the others, with its cost against evaluations.
