@@ -21,11 +21,11 @@ from srfcli.core.errors import SrfError
 from srfcli.laws.registry import bundled_registry
 from srfcli.laws.values import Effect
 from srfcli.results import report_text
-from srfcli.results.markup import VOID, Markup, tag
 from srfcli.results.plots import figure_bytes
 from srfcli.results.report import command_lines, merged, write_report
 from srfcli.results.report_figures import close_up, foremost, local_rms, run_figure, spots, trace
 from srfcli.results.report_text import number, percent, probability, spans, with_error
+from srfcli.results.tables import VOID, Markup, tag
 
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
 NOISE = 0.02

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import GeneratedModel, open_model
-from srfcli.core.arguments import explained
-from srfcli.core.errors import SrfError, as_names
+from srfcli.core.errors import SrfError, as_names, explained
 from srfcli.core.settings import DEFAULTS, Parameter, Resolved, resolve
 from srfcli.laws.registry import Registry, chosen_instead, load_registry
 from srfcli.laws.values import Effect, Law

@@ -24,11 +24,10 @@ from srfcli.diagnosis.search import Fitted
 from srfcli.diagnosis.verdict import Diagnosis, added, at_bounds
 from srfcli.laws.registry import Registry
 from srfcli.results import plots
-from srfcli.results.markup import tag
 from srfcli.results.provenance import Provenance, write_result
 from srfcli.results.report_figures import loads_figure, run_figure, trace
 from srfcli.results.report_text import unit_text
-from srfcli.results.tables import Column, Result, Table, json_text, plain_value, to_csv
+from srfcli.results.tables import Column, Result, Table, json_text, plain_value, tag, to_csv
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

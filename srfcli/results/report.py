@@ -21,7 +21,6 @@ from srfcli.core import __version__
 from srfcli.core.errors import SrfError
 from srfcli.core.files import unused_name, write_atomic
 from srfcli.results import report_figures
-from srfcli.results.markup import Markup, tag
 from srfcli.results.plots import figure_bytes
 from srfcli.results.provenance import sidecar_path
 from srfcli.results.report_text import (
@@ -42,7 +41,7 @@ from srfcli.results.report_text import (
     with_error,
     with_unit,
 )
-from srfcli.results.tables import plain_value
+from srfcli.results.tables import Markup, plain_value, tag
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,8 +17,7 @@ from srfcli.core.errors import Status, worst
 from srfcli.numerics.hopf import critical_point
 from srfcli.results import plots
 from srfcli.results.figures import gains
-from srfcli.results.markup import tag
-from srfcli.results.tables import STATUS, Column, Result, Table, TextResult
+from srfcli.results.tables import STATUS, Column, Result, Table, TextResult, tag
 
 if TYPE_CHECKING:
     import sympy as sp

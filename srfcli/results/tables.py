@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import io
 import json
 import math
@@ -13,12 +14,11 @@ from dataclasses import dataclass, field
 from enum import Enum
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO, final
 
 from srfcli.core import __version__
 from srfcli.core.errors import SrfError, Status, printable
 from srfcli.core.files import check_target, write_atomic
-from srfcli.results.markup import tag
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,6 +26,39 @@ if TYPE_CHECKING:
 
 ROWS_SHOWN = 20  # rows of a table that a notebook shows
 STATUS = "ok, or what keeps the row from being used as it stands"
+
+# HTML by small functions: all text is escaped unless it was built here.
+
+VOID = frozenset({"br", "hr", "img", "meta", "source"})
+
+
+@final
+class Markup(str):
+    """Text that is HTML already; any other text is escaped where it is put in."""
+
+    __slots__ = ()
+
+
+def html_text(value: Any) -> Markup:
+    """Return `value` as HTML: markup as it is, a list as its parts one after the other, all else escaped."""
+    if isinstance(value, Markup):
+        return value
+    if isinstance(value, list | tuple):
+        return Markup("".join(html_text(v) for v in value))
+    return Markup(html.escape(str(value), quote=True))
+
+
+def tag(name: str, /, *children: Any, **attributes: Any) -> Markup:
+    """Return an element; `class_` stands for class, an attribute that is None is left out."""
+    written = "".join(
+        f' {key.rstrip("_").replace("_", "-")}="{html.escape(str(value), quote=True)}"'
+        for key, value in attributes.items()
+        if value is not None
+    )
+    if name in VOID:
+        return Markup(f"<{name}{written}>")
+    return Markup(f"<{name}{written}>{html_text(list(children))}</{name}>")
+
 
 # A result as a table, and its form for a reader: aligned plain text, or rich on a terminal.
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from srfcli.codegen.c_source import GET_COMPILER, compiler
-from srfcli.core.arguments import explained
-from srfcli.core.errors import SrfError, as_names, check_choice, did_you_mean
+from srfcli.core.errors import SrfError, as_names, check_choice, did_you_mean, explained
 from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import BY, TRENDS, grouped
 from srfcli.data.values import Experiment

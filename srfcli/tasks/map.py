@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import GeneratedModel
-from srfcli.core.arguments import explained
-from srfcli.core.errors import SrfError, Status, check_choice
+from srfcli.core.errors import SrfError, Status, check_choice, explained
 from srfcli.core.parallel import Runner, run_here
 from srfcli.core.settings import require_parameter
 from srfcli.core.units import to_base

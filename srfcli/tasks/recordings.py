@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srfcli.core.arguments import explained
-from srfcli.core.errors import SrfError, Status, as_names, as_pairs, check_choice
+from srfcli.core.errors import SrfError, Status, as_names, as_pairs, check_choice, explained
 from srfcli.core.parallel import Runner, run_here
 from srfcli.core.settings import resolve
 from srfcli.core.units import from_base, parse_quantity, split_quantity, to_base

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.codegen.slider import SlidingSystem, declared
 from srfcli.codegen.splines import appended
-from srfcli.core.arguments import explained
-from srfcli.core.errors import SrfError, Status, as_pairs, did_you_mean, worst
+from srfcli.core.errors import SrfError, Status, as_pairs, did_you_mean, explained, worst
 from srfcli.core.settings import Parameter, check_value, require_parameter
 from srfcli.core.units import find_unit, from_base, parse_quantity, split_quantity, tidy, to_base
 from srfcli.data.description import MOST_OBSERVABLES
@@ -441,8 +440,9 @@ def runs_again(
     gauges = read_gauges(observables[0], noise=noise, lag1=lag1, quantum=quantum, seed=seed)
     jobs = tuple(_job(model, experiment, run, values, start) for run in runs)
     unknown = [run.name for run in runs if run.initial == "free"]
-    notes = (f"initial state of {', '.join(unknown)} not known: begun in steady sliding",) if unknown else ()
-    notes += () if "K" in values or not (told := experiment.rescaled()) else (told,)
+    begun = f"initial state of {', '.join(unknown)} not known: begun in steady sliding" if unknown else None
+    scaled = None if "K" in values else experiment.rescaled()
+    notes = tuple(note for note in (begun, scaled) if note)
     inputs = (experiment.path, *(run.file for run in runs))
     made = None if folder is None else _experiment_again(experiment, model, choice, values, folder, spread, seed)
     dropped = [p.name for p in experiment.parameters if p.name not in model.names]

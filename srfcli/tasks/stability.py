@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
-from srfcli.core.arguments import explained
-from srfcli.core.errors import SrfError, Status, as_names, check_choice, worst
+from srfcli.core.errors import SrfError, Status, as_names, check_choice, explained, worst
 from srfcli.core.settings import check_value, require_parameter
 from srfcli.core.units import to_base
 from srfcli.numerics.hopf import closed_forms, hopf_points, steady_is_stable, weakening
