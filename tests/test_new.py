@@ -178,7 +178,7 @@ def test_a_unit_that_no_heading_says_is_told(step: dict[str, np.ndarray]) -> Non
         (["t [s]", "v [um/s]", "Fs [N]", "Fn [N]"], ("--area", "0 mm^2"), "expected an area above 0", ""),
         (["t [s]", "v [um/s]", "Fs [N]", "Fn [N]"], ("--area", "3 mm^2", "--mass", "1 kg"), "a mass beside an area", ""),
         (["t [s]", "v [um/s]", "Upper stress [MPa]", "Lower stress [MPa]"], (), "which column is", "shear_stress=HEADING"),
-        (["t [s]", "v [um/s]", "shear one [N]", "shear two [N]", "Fn [N]"], (), "which column is", "shear_stress=HEADING"),
+        (["t [s]", "v [um/s]", "shear one [N]", "shear two [N]", "Fn [N]"], (), "which column is", "force=HEADING"),
     ],
 )  # fmt: skip
 def test_what_a_rig_has_to_say(headings: list[str], options: tuple[str, ...], said: str, hint: str) -> None:
@@ -414,7 +414,7 @@ def test_bounds_of_the_slip_length_are_the_recording_s(V: float, law: str) -> No
         (["still.csv", "--stiffness", "1 1/um"], "velocity or displacement? It has", "--column load_point_displacement=HEADING"),
         (["dated.csv", "--stiffness", "1 1/um", "--drive", "1"], "'01/02/2024 00:00:01'", "the seconds since the start"),
         (["twice.csv", "--stiffness", "1 1/um", "--drive", "1", "--load", "5 N"], "2 columns are called", "rename one"),
-        (["lift.csv", "--stiffness", "1 1/um"], "the load is -1 MPa", "--window FROM,TO"),
+        (["lift.csv", "--stiffness", "1 1/um"], "the load is -1 MPa", "--window 3,9.9"),
     ],
 )
 def test_what_is_missing_or_wrong_is_said_in_a_line_and_nothing_is_written(arguments: list[str], said: str, hint: str) -> None:
@@ -556,3 +556,34 @@ def test_times_rounded_in_minutes_leave_the_drive_even(step: dict[str, np.ndarra
     said = srf("check", "--no-simulate", ".").stdout
     assert "2 straight pieces, 1, 10 um/s" in said and "drive-smoothed" not in said and "reset:" not in said
     assert "upper = 500" in next(x for x in Path("experiment.toml").read_text().splitlines() if x.startswith("D0 ="))
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "said"),
+    [
+        ("time [s],v [um/s],a [kN],b [kN]\n0,1,2,3\n1,1,2,3\n", (), "--column force=HEADING"),
+        ("time [s],strain,normal stress [MPa],shear stress [MPa]\n0,0,2,3\n1,1,2,3\n", (), "--thickness '4 mm'"),
+        ("time [s],v [um/s],tau [MPa],sigma [MPa]\n0,1,2,3\n", ("--stiffness", "12 MPa"), "'30 MPa/mm', '0.21 N/um' or, of"),
+        ("\x89HDF\r\n\x1a\n\0\0\0,,\n", ("--format", "csv"), "no text, but bytes of another kind of file"),
+    ],
+    ids=["kN", "strain", "stiffness", "binary"],
+)
+def test_a_hint_names_what_would_do(text: str, options: tuple[str, ...], said: str) -> None:
+    Path("run1.csv").write_bytes(text.encode("latin-1"))
+    given = options if "--stiffness" in options else ("--stiffness", "30 N/mm", *options)
+    assert said in " ".join(srf("new", "run1.csv", *given, code=2).stderr.split())
+
+
+def test_an_unloading_at_the_end_is_refused_with_the_window_before_it(step: dict[str, np.ndarray]) -> None:
+    sigma = np.where(step["t"] < step["t"][-20], SIGMA, -0.05)
+    table(["time_s", "v", "tau_MPa", "sigma_n_MPa"], [step["t"], step["V"], SIGMA * step["mu"], sigma])
+    done = srf("new", "run1.csv", "--stiffness", "2e-3 1/um", code=2)
+    first, last = re.findall(r"--window (\S+),(\S+), say", done.stderr)[0]
+    assert (float(first), float(last)) == pytest.approx((step["t"][0], step["t"][-21]))
+    srf("new", "run1.csv", "--stiffness", "2e-3 1/um", "--window", f"{first},{last}")
+
+
+def test_a_largest_speed_beside_a_distance_is_told(step: dict[str, np.ndarray]) -> None:
+    numbers = [step["t"], np.cumsum(step["V"]), step["V"], SIGMA * step["mu"], SIGMA + 0 * step["t"]]
+    table(["Time [s]", "Distance [um]", "Max linear speed [um/s]", "Friction Force [N]", "Normal Force [N]"], numbers)
+    assert "[columns] load_point_displacement" in srf("new", "run1.csv", "--stiffness", "0.04 N/um").stderr

@@ -25,6 +25,7 @@ DATE = r"(\d{4})[-/](\d\d)[-/](\d\d)"
 STAMP = re.compile(rf"(?:{DATE}[T ])?(\d\d?):(\d\d):(\d\d(?:\.\d*)?) ?(Z|[+-]\d\d:?(?:\d\d)?)?")  # date, time of day, zone
 DAY = 86400.0  # s
 NUMBER = re.compile(r"[+-]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eEdD][+-]?\d++)?")  # possessive: in the time that the cell is long
+BINARY = re.compile(rb"[^\0]*[\x01-\x08\x0e-\x1f]")  # as no text begins
 INFINITE = re.compile(r"[+-]?inf(?:inity)?", re.IGNORECASE)
 
 
@@ -236,6 +237,9 @@ def _heading(path: Path) -> tuple[str, int, int]:
     """
     comment, at, number = "", 0, 0
     with path.open("rb") as stream:
+        if BINARY.match(stream.read(len(b"\x89HDF\r\n\x1a"))):
+            raise SrfError(f"{path}: no text, but bytes of another kind of file", "Leave the format out: the content tells it.")
+        stream.seek(0)
         while raw := stream.readline(LONGEST + 1):
             _check(path, raw, number + 1)
             line = raw.removeprefix(b"\xef\xbb\xbf") if number == 0 else raw

@@ -1,5 +1,6 @@
 """TDMS files of LabVIEW: one channel for each column."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -50,11 +51,13 @@ def tdms(path: Path) -> Source:
 def _library(path: Path) -> Any:
     try:
         import nptdms
+        from nptdms.log import log_manager
     except ImportError:
         raise SrfError(
             f"{path}: a TDMS file, which npTDMS reads, and npTDMS is not installed",
             'pip install "srfcli[tdms]", or export the file as text.',
         ) from None
+    log_manager.set_level(logging.ERROR)  # of a file that breaks off it warns, and is refused below
     return nptdms
 
 

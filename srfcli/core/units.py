@@ -158,7 +158,7 @@ def unit_factor(written: str, unit: str, geometry: Geometry = NO_GEOMETRY, *, wh
             strain = "stress per strain" if found.powers[2] else "strain"
             hint = f'A {strain} needs the layer\'s thickness, from which {unit} follow: [apparatus] thickness = "4 mm"'
             if found.powers[2]:
-                hint = f"A stiffness is a stress over a length, as in '30 MPa/mm'. {hint}"
+                hint = f"A stiffness is '30 MPa/mm', '0.21 N/um' or, of friction over a length, '1e-3 1/um'. {hint}"
             kind = "unit"
     prefix = f"{where}: " if where else ""
     said = f"{prefix}{written!r} measures {describe(found.powers)}, not {describe(wanted.powers)}"

@@ -26,7 +26,7 @@ from srfcli.core.units import (
     unit_factor,
 )
 from srfcli.data.columns import DRIVES, Columns, goes_backward, open_source, read_columns
-from srfcli.data.description import FORMAT, ROLES, check_unit, read_description
+from srfcli.data.description import FORMAT, GEOMETRY, ROLES, check_unit, read_description
 from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.groups import levels
 from srfcli.data.imposed import LOADS, StartsAtRest, Stroke, find_modulation, strokes
@@ -78,6 +78,7 @@ KINDS = {  # role -> kinds of units that a column called so has
     "normal_load": {"N"}, "normal_stress": {"MPa", "N"}, "force": {"N", "N*um"}, "shear_stress": {"MPa", "N", "N*um"},
     "friction": {"1"}, "elongation": {"um"},
 }  # fmt: skip
+NOT_EACH = {"max", "maximum", "peak", "nominal", "set"}  # of a velocity that is not that of each sample
 ALONE = {"time": {"s"}, "load_point_velocity": {"um/s", "rad/s"}, "shear_stress": {"N*um"}}  # units that tell a role alone
 ASIDE = {"thickness", "gap", "height", "dilation", "dilatancy", "compaction", "depth", "pore", "confining", "temperature", "temp",
          "humidity", "std", "error", "setpoint", "target", "command", "raw", "pz", "zpos"}  # fmt: skip
@@ -303,16 +304,34 @@ def missing(
         lacks.append(("`columns` time=HEADING", f"{path}: which column is the time? It has {listed}"))
     if not roles & set(OBSERVED):
         what = "friction, shear stress, force or elongation of the spring"
-        lacks.append(("`columns` shear_stress=HEADING", f"{path}: which column is {what}? It has {listed}"))
+        kinds = {_kind_of_unit(_spelled(h)[1]) for h in headings}
+        role = "force" if "N" in kinds and "MPa" not in kinds else "shear_stress"
+        lacks.append((f"`columns` {role}=HEADING", f"{path}: which column is {what}? It has {listed}"))
     if not (driven or roles.intersection(DRIVES)):
         pieces = "`drive` '60:3, 60:10' (DURATION:VELOCITY in s and um/s, 0 is a hold)"
         option = f"{pieces}, or `columns` load_point_displacement=HEADING"
         lacks.append((option, f"{path}: which column is the load point's velocity or displacement? It has {listed}"))
     if not (loaded or roles & {"normal_load", "normal_stress", "friction"}):
-        load, role = ("5 N", "normal_load") if roles & {"force"} else ("20 MPa", "normal_stress")
+        weighed = "N" in {_kind_of_unit(_spelled(h)[1]) for h in headings}
+        load, role = (
+            ("5 N", "normal_load")
+            if roles & {"force"} or (weighed and not roles & {"shear_stress"})
+            else ("20 MPa", "normal_stress")
+        )
         option = f"`load` '{load}', or `columns` {role}=HEADING"
         lacks.append((option, f"{path}: which column is the normal load or stress? It has {listed}"))
     return lacks
+
+
+def _another_drive(columns: Sequence[Named], aside: Sequence[str]) -> list[str]:
+    """Return what to say of a velocity whose heading names a largest or a set one, where a way was left aside."""
+    drive = next((c.heading for c in columns if c.role == "load_point_velocity"), "")
+    words = {h: set(re.findall(r"[a-z]+", _spelled(h)[0])) for h in (drive, *aside)}
+    ways = [h for h in aside if _kind_of_unit(_spelled(h)[1]) == "um" and words[h] & WORDS["load_point_displacement"]]
+    if not (ways and words[drive] & NOT_EACH):
+        return []
+    said = f"the drive is '{drive}', which may not be the velocity at each sample; '{ways[0]}' was left aside"
+    return [f'{said}, and [columns] load_point_displacement = {{ name = "{split_heading(ways[0])[0]}" }} takes the drive from it']
 
 
 def _unknown_units(headings: Sequence[str]) -> Iterator[tuple[str, str]]:
@@ -333,7 +352,7 @@ def _check_rig(columns: Sequence[Named], wish: Wish, path: Path) -> None:
         key = "thickness" if strain else needed.get(kind)
         if key is not None and key not in wish.rig:
             what = "strains need the thickness of the layer" if strain else "a rotary rig needs its radius"
-            raise SrfError(f"{path}: '{column.heading}' is in {column.unit}: {what}", f"Say it with `{key}` '25 mm'.")
+            raise SrfError(f"{path}: '{column.heading}' is in {column.unit}: {what}", f"Say it with `{key}` '{GEOMETRY[key]}'.")
 
 
 def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry) -> Draft:
@@ -368,6 +387,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         aside = [h for h in headings if h not in {n.heading for n in own}]
         if aside and path == files[0]:
             remarks.append(f"left aside: {', '.join(aside)}")
+            remarks += _another_drive(own, aside)
     sketch, told = _parted(_Sketch(tuple(files), names, folder, wish, named), registry)
     remarks += told
     for name in wish.holdout:
@@ -574,7 +594,9 @@ def _read(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, Experiment]:
                 sketch = replace(sketch, free=(*sketch.free, error.run))
             except SrfError as error:
                 if error.kind == "no contact":
-                    error.hint = "Take the part in contact: `window` FROM,TO in seconds."
+                    found = re.search(r"such as \[(\S+), (\S+)\] s", error.hint or "")
+                    part = f"{found[1]},{found[2]}, say, in s" if found else "FROM,TO in seconds"
+                    error.hint = f"Take the part in contact: `window` {part}."
                 raise
 
 

@@ -276,9 +276,9 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
             f"{run.node.where}: friction is recorded without a load, and the stiffness is in {apparatus.stated}",
             'Give the run load = "20 MPa", or the stiffness as friction per micron, in 1/um.',
         )
-    drive, told, resets = drive_of(run, columns)
     units = _units(run, columns, apparatus)
-    load, weighed = load_of(run, columns, "MPa" if any(units.values()) else "N")
+    load, weighed = load_of(run, columns, "MPa" if any(units.values()) else "N")  # before the drive, which takes longest
+    drive, told, resets = drive_of(run, columns)
     check_start(run, drive, float(t[0]))
     role, *beside = [c.role for c in columns.channels.values() if c.role in OBSERVABLES | OTHER_OBSERVABLES]
     at_start = load.rest(float(t[0]))

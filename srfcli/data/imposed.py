@@ -735,6 +735,7 @@ LOAD_BLOCKS = 16  # whose means are compared to see whether a load is constant
 ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
 APART = 2.0  # times as far from its level as the next sample: a spike; the tail of a noise of 4 degrees of freedom has 7 %
 NO_CONTACT = 1e-15  # N: no contact
+PRESSED = 0.5  # of the median load: above it the slider is pressed on
 SAMPLES_A_PERIOD = 8  # of a modulation, from which a column shows it to 1e-3 of its amplitude
 SMALLEST_MODULATION = 5e-4  # relative amplitude of a modulation, at least: a servo varies the load by less
 
@@ -804,14 +805,23 @@ def load_from_column(place: Place, W: Array, unit: str = "N") -> tuple[Load, lis
     good = known & ~bad
     filled = np.interp(t, t[good], filled[good])
     if filled.min() < NO_CONTACT:
-        at = int(filled.argmin())
+        at, part = int(filled.argmin()), _pressed(t, filled)
         raise SrfError(
             f"{place.span(at, at)}, column '{place.heading}': the load is {filled[at]:.6g} {unit}",
-            "The slider must stay in contact: zero the gauge ([columns] offset), or take a window without this part.",
+            f"The slider must stay in contact: zero the gauge ([columns] offset), or take a window without this part{part}.",
             kind="no contact",
         )
     load, told = _smooth(place, filled, unit)
     return load, [*notices, *told]
+
+
+def _pressed(t: Array, W: Array) -> str:
+    """Return ", such as [FROM, TO]" of the longest time in which the loads W (n,) are those of a contact, if there is any."""
+    low = PRESSED * float(np.median(W))  # less is loading and unloading
+    ends = np.flatnonzero(np.diff((max(low, NO_CONTACT) < W).astype(int), prepend=0, append=0)).reshape(-1, 2)
+    spans = [(float(t[b - 1] - t[a]), a, b - 1) for a, b in ends.tolist()]
+    length, first, last = max(spans, default=(0.0, 0, 0))
+    return f", such as [{t[first]:.7g}, {t[last]:.7g}] s" if length > 0 else ""
 
 
 def _smooth(place: Place, W: Array, unit: str) -> tuple[Load, list[Notice]]:
