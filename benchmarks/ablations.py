@@ -40,7 +40,7 @@ from marked import heading, marked, tell
 import srfcli.diagnosis.verdict  # noqa: F401  with all that a diagnosis uses, for its constants
 from srfcli.codegen.model import Array
 from srfcli.core.parallel import run_processes
-from srfcli.diagnosis.scores import Remainder
+from srfcli.diagnosis.scores import ResidualProjection
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.validation.blind import Answer, Task, answer_case, diagnose_case, failed, read_answers, write_answers
 from srfcli.validation.cases import unseal
@@ -61,10 +61,10 @@ class WithoutColour(ModelSearch):
     options: ClassVar[Mapping[str, Any]] = {"processes": ()}
 
 
-class Bare(Remainder):
+class Bare(ResidualProjection):
     """What a fit leaves, nothing of it taken off."""
 
-    def free(self, columns: Array) -> Array:
+    def project(self, columns: Array) -> Array:
         """Return columns as they are."""
         return columns
 
@@ -72,12 +72,12 @@ class Bare(Remainder):
 class WithoutProjection(ModelSearch):
     """The search whose scores take nothing off."""
 
-    remainder = Bare
+    projection = Bare
 
 
 STEPS = {  # a step: the method that is left out
     "another-ageing-law-near-by": "_try_ageing_laws",
-    "from-the-file": "_fit_afresh",
+    "from-the-file": "_refit_from_start_values",
     "likeliest-from-the-file": "_fit_likeliest_afresh",
     "pairs-from-the-file": "_with_a_second",
     "scores-without-field": "_expand_without_field",
@@ -87,7 +87,7 @@ STEPS = {  # a step: the method that is left out
     "one-run": "_in_one_run",
     "elimination": "_eliminate",
     "further-colour": "_with_more_colour",
-    "after-the-best": "_go_on",
+    "after-the-best": "_fall_back",
     "other-maxima": "_at_other_maxima",
 }
 
@@ -161,7 +161,9 @@ def main() -> None:
     parser.add_argument("--beside", type=Path, required=True, help="answers.jsonl of the trial, marked beside")
     parser.add_argument("--known", type=Path, help="known.jsonl of the trial: what was visible")
     parser.add_argument("--without", action="append", default=[], help="part, or steps joined by commas")
-    parser.add_argument("--with", dest="constants", action="append", default=[], help="a constant and its value: WORTH=24")
+    parser.add_argument(
+        "--with", dest="constants", action="append", default=[], help="a constant and its value: MIN_SCORE_GAIN=24"
+    )
     parser.add_argument("--cases", type=int, help="how many cases to take, from the first on")
     parser.add_argument("--quickest", type=int, help="how many of these to take, by the CPU of the whole diagnosis")
     parser.add_argument("--workers", type=int, default=1)
@@ -170,7 +172,9 @@ def main() -> None:
     for constant in given.constants:
         name, _, value = constant.partition("=")
         if not holding(name) or not re.fullmatch(r"\d+(\.\d*)?", value):
-            parser.error(f"--with {constant}: give a number of srfcli.diagnosis or srfcli.inference and its value, WORTH=24")
+            parser.error(
+                f"--with {constant}: give a number of srfcli.diagnosis or srfcli.inference and its value, MIN_SCORE_GAIN=24"
+            )
     for parts in given.without:
         if parts not in PARTS and not STEPS.keys() >= set(parts.split(",")):
             parser.error(f"--without {parts}: give one of {', '.join(PARTS)}, or steps joined by commas: {', '.join(STEPS)}")

@@ -4,10 +4,10 @@
 
 TRIAL is a folder of `srf prove`, unsealed. The model that holds what is concealed is fitted from the truth's own parameters, with
 the gauge noise and the field that were drawn as start values, to the recordings that the search sees. Its log evidence stands
-beside that of the likeliest model that the trial tried: by more than CLOSE above it, the search failed; by more than CLOSE below,
-another model explains the recordings better; else they do not tell. Without cases those are taken that were not answered rightly
-and whose effects are all registered. `white` is the mean square of the innovations at the truth: far from 1 the fitter's
-equations would not be the generator's.
+beside that of the likeliest model that the trial tried: by more than LOG_BAYES_MARGIN above it, the search failed; by more than
+LOG_BAYES_MARGIN below, another model explains the recordings better; else they do not tell. Without cases those are taken that
+were not answered rightly and whose effects are all registered. `white` is the mean square of the innovations at the truth: far
+from 1 the fitter's equations would not be the generator's.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import GAUGE_NOISE
 from srfcli.diagnosis.hypotheses import Hypothesis, own_parameters
-from srfcli.diagnosis.search import CLOSE, NEAR, ModelSearch
+from srfcli.diagnosis.search import LOG_BAYES_MARGIN, SEARCH_TOLERANCE, ModelSearch
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import Likelihood, StateSpaceFit, maximise
 from srfcli.laws.registry import bundled_registry
@@ -102,11 +102,11 @@ def fitted(folder: Path, concealed: dict[str, Any]) -> tuple[str, float, float, 
         longs = {p.name: long for long, p in own_parameters(effect, problem.model).items()}
         values |= {longs.get(name, name): float(value) for name, value in of_an_effect(effect, truth).items()}
     values |= {"field_amplitude": concealed["rough"], "field_length": truth.track.length}
-    beside = maximise(likelihood, likelihood.coordinates(values), held=problem.names, close=NEAR)  # noise and field
+    beside = maximise(likelihood, likelihood.coordinates(values), fixed=problem.names, close=SEARCH_TOLERANCE)  # noise and field
     white = float(np.mean(np.concatenate([f.white for f in beside.point.runs]) ** 2))
-    fit = StateSpaceFit(likelihood, maximise(likelihood, beside.point.x, close=NEAR))
-    judged = search._judged(hypothesis, fit)
-    evidence = judged.separate + (judged.shared or 0.0)
+    fit = StateSpaceFit(likelihood, maximise(likelihood, beside.point.x, close=SEARCH_TOLERANCE))
+    judged = search._assessed(hypothesis, fit)
+    evidence = judged.separate_field_evidence + (judged.shared or 0.0)
     return hypothesis.name, evidence, fit.log_likelihood, white, search.experiment.runs is search.whole.runs
 
 
@@ -139,7 +139,7 @@ def main() -> None:
             continue
         best = max(answer.tried.values(), key=lambda t: t["evidence"])
         more, higher = evidence - best["evidence"], height - best["log_likelihood"]
-        outcome = MISSED if more > CLOSE else LESS if more < -CLOSE else UNTOLD
+        outcome = MISSED if more > LOG_BAYES_MARGIN else LESS if more < -LOG_BAYES_MARGIN else UNTOLD
         counted[outcome] += whole
         told = (f"{higher:.1f}", f"{more:.1f}", outcome) if whole else ("", "", "the search saw a part of the readings")
         rows.append((case, name, answer.verdict, f"{white:.2f}", *told))

@@ -25,10 +25,10 @@ import numpy.typing as npt
 from common import Report
 from marked import marked
 
-from srfcli.diagnosis.verdict import MISSED, TEMPER, UNEXPLAINED
+from srfcli.diagnosis.verdict import CALIBRATION_TEMPERATURE, PROB_REGISTERED_IF_UNKNOWN, PROB_UNREGISTERED_IF_PASSED
 from srfcli.validation.blind import read_answers
 from srfcli.validation.cases import unseal
-from srfcli.validation.marks import Mark, calibrated, calibration, calibration_of, holds
+from srfcli.validation.marks import GradedAnswer, calibrated, calibration, calibration_of, holds
 
 TEMPERS = np.geomspace(0.5, 60.0, 97)
 LEAST = 0.5  # cases that are added to each side of a share, so that none is 0 or 1 (Jeffreys)
@@ -38,12 +38,12 @@ Three: TypeAlias = tuple[float, float, float]
 Array: TypeAlias = npt.NDArray[np.float64]
 
 
-def passed(m: Mark) -> bool:
+def passed(m: GradedAnswer) -> bool:
     """Return whether a model passed every test, so that hypotheses have a share, and held-out runs do not refuse it."""
     return m.answer.verdict != "unknown"
 
 
-def restated(m: Mark, numbers: Three) -> Mark:
+def restated(m: GradedAnswer, numbers: Three) -> GradedAnswer:
     """Return the mark with the confidence that these numbers state."""
     temper, unexplained, missed = numbers
     unknown = unexplained if passed(m) else 1 - missed
@@ -56,18 +56,18 @@ def restated(m: Mark, numbers: Three) -> Mark:
     return replace(m, answer=replace(m.answer, confidence=found), top=top, stated=found[top], hit=hit(m, top))
 
 
-def hit(m: Mark, name: str) -> bool:
+def hit(m: GradedAnswer, name: str) -> bool:
     """Return whether a hypothesis is the truth, or as good."""
     return holds(name, m.accepted)
 
 
-def score(m: Mark) -> float:
+def score(m: GradedAnswer) -> float:
     """Return the log of the confidence in the truth."""
     share = sum(c for n, c in m.answer.confidence.items() if hit(m, n))
     return math.log(max(share, FLOOR))
 
 
-def shares(marks: Sequence[Mark]) -> Array:
+def shares(marks: Sequence[GradedAnswer]) -> Array:
     """Return what the truth has of the confidence in models that were fitted (n, m), before that in `unknown`, for TEMPERS."""
     found = np.zeros((len(marks), TEMPERS.size))
     for k, m in enumerate(marks):
@@ -79,7 +79,7 @@ def shares(marks: Sequence[Mark]) -> Array:
     return found
 
 
-def fitted(marks: Sequence[Mark], share: Array | None = None) -> Three:
+def fitted(marks: Sequence[GradedAnswer], share: Array | None = None) -> Three:
     """Return temper, unexplained and missed under which the truths are likeliest; `share` is that of these marks."""
     share = shares(marks) if share is None else share
     spoken, unknown = np.array([passed(m) for m in marks]), np.array([hit(m, "unknown") for m in marks])
@@ -92,7 +92,7 @@ def fitted(marks: Sequence[Mark], share: Array | None = None) -> Three:
     return float(TEMPERS[best]), float(unexplained), float(missed)
 
 
-def tell(report: Report, who: str, marks: Sequence[Mark]) -> None:
+def tell(report: Report, who: str, marks: Sequence[GradedAnswer]) -> None:
     """Say mean log score, expected calibration error with what it would be by chance, and the bins of stated confidence."""
     error, stated = calibration_of(marks)[1], np.array([m.stated for m in marks])
     drawn = np.random.default_rng(0).random((DRAWS, stated.size)) < stated  # what a perfect calibration hits
@@ -105,7 +105,7 @@ def tell(report: Report, who: str, marks: Sequence[Mark]) -> None:
     report.table([c.name for c in table.columns], rows)
 
 
-def by_others(marks: Sequence[Mark]) -> list[Mark]:
+def by_others(marks: Sequence[GradedAnswer]) -> list[GradedAnswer]:
     """Return each fifth of the cases with the confidence that the others' numbers state."""
     order = np.random.default_rng(0).permutation(len(marks))
     found = []
@@ -116,9 +116,9 @@ def by_others(marks: Sequence[Mark]) -> list[Mark]:
     return found
 
 
-def read(folders: Sequence[Path]) -> list[Mark]:
+def read(folders: Sequence[Path]) -> list[GradedAnswer]:
     """Return the marks of the cases with an answer."""
-    found: list[Mark] = []
+    found: list[GradedAnswer] = []
     for folder in folders:
         truths: Mapping[str, object] = unseal(folder / "bank", folder / "truths.json")
         answers = [a for a in read_answers(folder / "answers.jsonl").values() if a.confidence]
@@ -131,15 +131,17 @@ def main() -> None:
     """Fit the three numbers to the trials, say what they are worth, and check them on another trial."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("trials", type=Path, nargs="+")
-    parser.add_argument("--temper", type=float, default=TEMPER, help="of their answers: 3 up to the 16th trial, 1 to the 28th")
+    parser.add_argument(
+        "--temper", type=float, default=CALIBRATION_TEMPERATURE, help="of their answers: 3 up to the 16th trial, 1 to the 28th"
+    )
     parser.add_argument("--check", type=Path, action="append", default=[], help="trials that were answered with the same temper")
     parser.add_argument("--numbers", type=float, nargs=3, help="those of other trials, that state what these would have")
     given = parser.parse_args()
 
-    def untempered(marks: Sequence[Mark]) -> list[Mark]:
-        return [restated(m, (1 / given.temper, UNEXPLAINED, MISSED)) for m in marks]
+    def untempered(marks: Sequence[GradedAnswer]) -> list[GradedAnswer]:
+        return [restated(m, (1 / given.temper, PROB_UNREGISTERED_IF_PASSED, PROB_REGISTERED_IF_UNKNOWN)) for m in marks]
 
-    now = (TEMPER, UNEXPLAINED, MISSED)
+    now = (CALIBRATION_TEMPERATURE, PROB_UNREGISTERED_IF_PASSED, PROB_REGISTERED_IF_UNKNOWN)
     report, told = Report("calibration", __doc__ or ""), read(given.trials)
     for folder in given.trials:
         trial = json.loads((folder / "trial.json").read_text(encoding="utf-8"))

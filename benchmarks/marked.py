@@ -12,8 +12,8 @@ from common import Report
 from srfcli.results.tables import cell_text
 from srfcli.validation.blind import Answer
 from srfcli.validation.marks import (
-    Mark,
-    Sight,
+    Detectability,
+    GradedAnswer,
     ablated,
     by_effect,
     by_outside,
@@ -21,20 +21,20 @@ from srfcli.validation.marks import (
     calibrated,
     confusion,
     cost,
-    held,
-    mark,
+    grade,
+    held_out_errors,
     rates,
-    sizes,
+    size_errors,
 )
 
 
-def marked(truths: dict[str, Any], answers: Sequence[Answer], known: Path | None) -> list[Mark]:
+def marked(truths: dict[str, Any], answers: Sequence[Answer], known: Path | None) -> list[GradedAnswer]:
     """Return the marks; without what was visible everything that is concealed counts as visible."""
-    sights = {}
+    detectabilities = {}
     if known is not None:
         for line in known.read_text(encoding="utf-8").splitlines():
-            sights[json.loads(line)["case"]] = Sight(**json.loads(line))
-    return [mark(truths[a.case], a, sights.get(a.case, Sight(a.case))) for a in answers]
+            detectabilities[json.loads(line)["case"]] = Detectability(**json.loads(line))
+    return [grade(truths[a.case], a, detectabilities.get(a.case, Detectability(a.case))) for a in answers]
 
 
 def heading(report: Report, bank: str, cases: int, known: Path | None) -> None:
@@ -44,9 +44,9 @@ def heading(report: Report, bank: str, cases: int, known: Path | None) -> None:
     report.say(f"# {asked}")
 
 
-def tell(report: Report, marks: Sequence[Mark], who: str) -> None:
+def tell(report: Report, marks: Sequence[GradedAnswer], who: str) -> None:
     """Say the tables of `srf prove` for these marks."""
-    made = (confusion, rates, by_effect, by_outside, by_strength, calibrated, held, sizes, cost, ablated)
+    made = (confusion, rates, by_effect, by_outside, by_strength, calibrated, held_out_errors, size_errors, cost, ablated)
     for table in (make(marks) for make in made):
         if table.rows:
             report.say(f"\n{who}: {table.title}")

@@ -8,7 +8,7 @@ later run goes on there. The truths are opened when every case is answered.
 
 The first two compare models that run freely: without a random field. They have the candidates, bounds and priors of the
 diagnosis, and begin where it fits the baseline while held, as sparse regression does. Every effect is scored at first order, in
-all runs and in one alone. The MOST_FOLLOWED with the largest gain, what is built in (a mass, an interface, a gauge that lags)
+all runs and in one alone. The MAX_EXTENSIONS with the largest gain, what is built in (a mass, an interface, a gauge that lags)
 and the other ageing laws get NEAR_STEPS of Fisher scoring; the FOLLOWED likeliest are maximised. The best, if its log evidence is
 DECISIVE above that of the baseline, is extended by a second effect in the same way. Of all runs every so-many-th reading is
 taken, READINGS at most together. After LIMIT s of CPU for its fits the best so far is a rival's answer. That names a model if its
@@ -59,12 +59,12 @@ from srfcli.data.experiment import read_experiment
 from srfcli.data.gauge import GaugeNoise, find_noise
 from srfcli.data.values import Run
 from srfcli.diagnosis.hypotheses import Hypothesis
-from srfcli.diagnosis.search import BUILT_SPAN, MOST_EFFECTS, NEAR, ModelSearch
-from srfcli.inference.state_space import HOPELESS, Likelihood, Maximum, StateSpaceFit, log_evidence, maximise
+from srfcli.diagnosis.search import MAX_EFFECTS, SEARCH_TOLERANCE, STRUCTURAL_SPAN, ModelSearch
+from srfcli.inference.state_space import PRUNING_DEFICIT, Likelihood, Maximum, StateSpaceFit, log_evidence, maximise
 from srfcli.laws.registry import Registry, load_registry
 from srfcli.validation.blind import Answer, failed, read_answers, write_answers
 from srfcli.validation.cases import unseal
-from srfcli.validation.marks import Mark, rate
+from srfcli.validation.marks import GradedAnswer, rate
 
 READINGS = 4000  # of all runs
 RTOL = 3e-2  # of the filter; 1e-4 where nothing puts the motion right
@@ -124,7 +124,7 @@ class Comparison:
     def maximised(self, own: Likelihood, x: Array, **how: Any) -> Maximum:
         """Return the maximum from x; the process keeps its quality, which makes it a Matern 3/2."""
         held = [n for n in own.names if n.startswith("gauge_quality")]
-        return maximise(own, x, held=held, progress=self.search.progress, **how)
+        return maximise(own, x, fixed=held, progress=self.search.progress, **how)
 
     def likeliest(self, own: Likelihood, starts: Sequence[Mapping[str, float]]) -> Array | None:
         """Return the likeliest of several starts, in coordinates; None where the recordings can be followed from none."""
@@ -156,11 +156,11 @@ class Comparison:
                 return
             found = self.maximised(base, x, steps=NEAR_STEPS, widths=())
             self.keep(Hypothesis(), base, found)
-            found = self.maximised(base, found.point.x, close=NEAR)
+            found = self.maximised(base, found.point.x, close=SEARCH_TOLERANCE)
             self.keep(Hypothesis(), base, found)
             self._extend(self.models[Hypothesis().name])
             enough = self.models[Hypothesis().name].evidence + DECISIVE
-            if self.best.evidence > enough and len(self.best.hypothesis.effects) < MOST_EFFECTS:
+            if self.best.evidence > enough and len(self.best.hypothesis.effects) < MAX_EFFECTS:
                 self._extend(self.best)
 
     def _first_starts(self, own: Likelihood) -> list[dict[str, float]]:
@@ -195,22 +195,22 @@ class Comparison:
                 self.keep(hypothesis, own, found)
                 moved.append((found.expected / self.temper + self.search._prior(hypothesis), hypothesis, own, found))
         for expected, hypothesis, own, found in sorted(moved, key=lambda m: -m[0])[:FOLLOWED]:
-            if expected > self.best.evidence - HOPELESS:
-                self.keep(hypothesis, own, self.maximised(own, found.point.x, steps=15, close=NEAR, widths=()))
+            if expected > self.best.evidence - PRUNING_DEFICIT:
+                self.keep(hypothesis, own, self.maximised(own, found.point.x, steps=15, close=SEARCH_TOLERANCE, widths=()))
 
     def _candidates(self, model: Model) -> list[tuple[Hypothesis, Starts]]:
         """Return the models with one part more than this one, and from where each is fitted, the most promising first."""
         search, hypothesis, values = self.search, model.hypothesis, model.fit.values
-        node = search._passed(hypothesis, model.fit)
+        node = search._waypoint(hypothesis, model.fit)
         found: list[tuple[Hypothesis, Starts]] = []
         for move in search._extensions(node, node, search._gains(search._scores(node)), 0.0):
-            starts = [search._sized(move, share, shifts) for shifts in (move.shifts, {}) for share in SHARES]
+            starts = [search._values_at_share(move, share, shifts) for shifts in (move.shifts, {}) for share in SHARES]
             found.append((move.hypothesis, partial(listed, starts)))
         if not hypothesis.effects and not hypothesis.ageing:
             stated, *modifiers = search.experiment.choice.ageing.split("+")
             laws = [Hypothesis((), "+".join([law, *modifiers])) for law in search.laws if law != stated]
             found += [(law, partial(listed, [values])) for law in laws]
-        built = [e for e in search._joining(node) if e.settings or e.observed]
+        built = [e for e in search._absent_effects(node) if e.settings or e.observed]
         return found + [(Hypothesis((*hypothesis.effects, e), hypothesis.ageing), partial(sizes_of, model)) for e in built]
 
     def contenders(self) -> list[Model]:
@@ -228,7 +228,7 @@ def sizes_of(model: Model, own: Likelihood) -> Sequence[Mapping[str, float]]:
     """Return a model's values beside several sizes of what another likelihood has built in."""
     new = next(n for n in own.problem.names if n not in model.fit.likelihood.problem.names)
     low, high = (own.values(edge)[new] for edge in (own.lower, own.upper))
-    return [{**model.fit.values, new: size} for size in np.geomspace(max(low, high / BUILT_SPAN), high, SIZES).tolist()]
+    return [{**model.fit.values, new: size} for size in np.geomspace(max(low, high / STRUCTURAL_SPAN), high, SIZES).tolist()]
 
 
 def noise_of(run: Run) -> GaugeNoise:
@@ -446,10 +446,10 @@ def told(hits: int, count: int, interval: tuple[float | None, float | None]) -> 
     return f"{hits} of {count}" + (f" ({100 * low:.0f} to {100 * high:.0f})" if low is not None and high is not None else "")
 
 
-def column(marks: Sequence[Mark]) -> list[str]:
+def column(marks: Sequence[GradedAnswer]) -> list[str]:
     """Return one column of the table."""
 
-    def share(chosen: Sequence[Mark], flag: Callable[[Mark], bool]) -> str:
+    def share(chosen: Sequence[GradedAnswer], flag: Callable[[GradedAnswer], bool]) -> str:
         found = rate(flag(m) for m in chosen)
         return told(found.hits, found.count, found.interval)
 
@@ -488,8 +488,8 @@ def main() -> None:
     answers = [answered(trial, cases, asked.kept) for trial, cases in chosen]
     report = Report("rivals", __doc__ or "")
     report.say(f"# dynesty {version('dynesty')}, pysindy {version('pysindy')}")
-    marks: dict[str, dict[tuple[int, str], Mark]] = {name: {} for name in TITLES}
-    free: dict[str, dict[tuple[int, str], Mark]] = {name: {} for name in TITLES}
+    marks: dict[str, dict[tuple[int, str], GradedAnswer]] = {name: {} for name in TITLES}
+    free: dict[str, dict[tuple[int, str], GradedAnswer]] = {name: {} for name in TITLES}
     for (trial, _), found in zip(chosen, answers, strict=True):  # only now
         truths, known = unseal(trial / "bank", trial / "truths.json"), trial / "known.jsonl"
         seed = json.loads((trial / "trial.json").read_text(encoding="utf-8"))["seed"]

@@ -120,16 +120,16 @@ def of_emcee(target: Target, moves: list[tuple[emcee.moves.Move, float]], ours: 
     scale = posterior._straight(t.log_posterior, t.best, t.covariance, t.lower)
 
     def log_density(y: Array) -> float:
-        theta = scale.back(y)
+        theta = scale.inverse_transform(y)
         return t.log_posterior(theta) + float(np.sum(np.log(theta[scale.logarithmic])))
 
     over = np.where(scale.logarithmic, t.best, 1.0)
     root = np.linalg.cholesky(t.covariance / np.outer(over, over))
-    start = scale.there(t.best) + np.random.default_rng(seed).standard_normal((chains, k)) @ root.T
+    start = scale.transform(t.best) + np.random.default_rng(seed).standard_normal((chains, k)) @ root.T
     sampler = emcee.EnsembleSampler(chains, k, log_density, moves=moves)
     sampler._random = np.random.RandomState(seed)
     sampler.run_mcmc(start, ours.burn_in + steps)
-    found = scale.back(sampler.get_chain(discard=ours.burn_in))
+    found = scale.inverse_transform(sampler.get_chain(discard=ours.burn_in))
     return Posterior(ours.names, found, ours.burn_in, float(np.mean(sampler.acceptance_fraction)))
 
 

@@ -26,7 +26,7 @@ from ablations import STEPS
 from common import Report
 from marked import marked
 
-from srfcli.diagnosis.search import CLOSE, Fitted, ModelSearch
+from srfcli.diagnosis.search import LOG_BAYES_MARGIN, Fitted, ModelSearch
 from srfcli.validation.blind import Answer, diagnose_case
 from srfcli.validation.trials import answer_all, begin, open_truths
 
@@ -68,14 +68,14 @@ class Traced(ModelSearch):
         step = self.asked.get(move.number if move else 0, self.steps[-1])
         self.fits[step] += 1
         found = super().fit(move)
-        if found.name not in self.fitted or found.separate > self.fitted[found.name].separate:
+        if found.name not in self.fitted or found.separate_field_evidence > self.fitted[found.name].separate_field_evidence:
             self.found[found.name] = step
         return found
 
     def trace(self) -> dict[str, Any]:
         """Return what is kept of a search that has ended."""
         self._charge()
-        close = [f for f in self.ranked() if f.evidence > self.best().evidence - CLOSE]
+        close = [f for f in self.ranked() if f.evidence > self.best().evidence - LOG_BAYES_MARGIN]
         return {
             "best": self.best().name, "by": self.found.get(self.best().name, OTHER),
             "close": {f.name: self.found.get(f.name, OTHER) for f in close},

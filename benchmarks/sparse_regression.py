@@ -48,7 +48,7 @@ from srfcli.diagnosis.search import ModelSearch
 from srfcli.laws.registry import Registry, load_registry
 from srfcli.validation.blind import FAILED, Answer, failed, read_answers, write_answers
 from srfcli.validation.cases import unseal
-from srfcli.validation.marks import Mark
+from srfcli.validation.marks import GradedAnswer
 
 MARGIN, CHANCE = 1.04, 3.72  # of the remainder over that of a simulated baseline; standard errors of one in 10^4
 LEAST_NOISE = 0.005  # um
@@ -203,7 +203,7 @@ def main() -> None:
     report.table(head, [row_of(m) for m in marked(truths, answers, given.known)])
 
 
-def row_of(m: Mark) -> tuple[str, ...]:
+def row_of(m: GradedAnswer) -> tuple[str, ...]:
     """Return what is told of one case."""
     note, track = m.answer.failure.partition("; set")[0], "rough" if m.rough else "smooth"
     hidden, kept = ("+".join(names) for names in (m.hidden, m.answer.parameters))

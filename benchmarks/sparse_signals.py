@@ -17,7 +17,7 @@ from scipy.interpolate import make_interp_spline
 
 from srfcli.codegen.model import GeneratedModel
 from srfcli.data.values import Experiment, Run
-from srfcli.inference.prediction import of_run, predict
+from srfcli.inference.prediction import effect_inputs, predict
 
 Array = np.ndarray
 Sizes = Mapping[str, float]
@@ -158,7 +158,7 @@ def signals(run: Run, *, noise: float, lag1: float, guide: Array | None = None) 
     under a modulation v is a train of pulses, and a gauge at ten samples a period does not show them.
     """
     step, t = float(np.median(np.diff(run.t))), run.t
-    about = of_run(run)
+    about = effect_inputs(run)
     modulated, omega = bool(about["modulated"]), 2 * np.pi * about["f"]
     cuts = [0, *np.searchsorted(t, np.array(run.drive.breaks) - 1e-9).tolist(), t.size]
     if modulated:

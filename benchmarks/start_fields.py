@@ -5,8 +5,8 @@
 TRIAL is a folder of `srf prove`, unsealed. Of each case whose physics is registered the right model is fitted with white noise,
 as `fit_state_space` begins: half of the scoring steps under each field, then as many again where that is no maximum yet. Ending
 within NEAR of the likeliest counts as reached. `the likeliest of these` begins under the field that is likeliest at the start
-values; `the first few in turn` is what a fit does: one field of WIDE after the other, until one leads near a maximum under a
-field that is narrower than at the start.
+values; `the first few in turn` is what a fit does: one field of WIDE_FIELDS after the other, until one leads near a maximum under
+a field that is narrower than at the start.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from at_the_truth import right_problem
 from common import Report
 
 from srfcli.core.errors import SrfError
-from srfcli.inference.state_space import FIELD, NOT_CONVERGED, SCORING_STEPS, WIDE, Likelihood, maximise
+from srfcli.inference.state_space import FIELD, NOT_CONVERGED, SCORING_STEPS, WIDE_FIELDS, Likelihood, maximise
 from srfcli.validation.cases import unseal
 
-FIELDS = (*WIDE, (0.03, 1.0), (0.03, 3.0), (0.02, 10.0), (0.01, 1.0), (0.003, 3.0), (0.003, 0.25))
+FIELDS = (*WIDE_FIELDS, (0.03, 1.0), (0.03, 3.0), (0.02, 10.0), (0.01, 1.0), (0.003, 3.0), (0.003, 0.25))
 NEAR = 3.0  # in log likelihood
 RTOL = 1e-3  # of the integration, as in a search
 Found = dict[tuple[float, float], tuple[float, float, float, bool]]
@@ -44,7 +44,7 @@ def tried(case: tuple[Path, dict[str, Any]]) -> Found | str:
     found = {}
     for wide, long in FIELDS:
         x, since = likelihood.start.copy(), time.process_time()
-        x[at] += np.log([wide / WIDE[0][0], long])
+        x[at] += np.log([wide / WIDE_FIELDS[0][0], long])
         height, reached, shrunk = likelihood.at(x, slopes=False).log_likelihood, -np.inf, False
         if np.isfinite(height):
             best = maximise(likelihood, x, steps=SCORING_STEPS // 2, close=1.0)
@@ -58,7 +58,7 @@ def tried(case: tuple[Path, dict[str, Any]]) -> Found | str:
 
 def chosen(found: Found) -> dict[str, list[tuple[float, float]]]:
     """Return the fields under which each way of beginning a fit goes on."""
-    tries = [f for f in WIDE if np.isfinite(found[f][0])]
+    tries = [f for f in WIDE_FIELDS if np.isfinite(found[f][0])]
     few = next((tries[: i + 1] for i, f in enumerate(tries) if found[f][3]), tries)
     ways = {"the likeliest of these": [max(found, key=lambda f: found[f][0])], "the first few in turn, as a fit": few}
     return ways | {f"{wide:g} over {long:g}": [(wide, long)] for wide, long in FIELDS}

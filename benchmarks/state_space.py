@@ -83,7 +83,7 @@ def one(task: tuple[int, float, bool, str]) -> dict[str, object]:
     if without == "weights":
         state_space.WIDTHS = ()
     if without == "faint":
-        state_space._with_faint_fields = lambda fitted, rough: fitted
+        state_space._with_faint_fields = lambda fitted, field_likelihood: fitted
     begun = time.process_time()
     found = fit_state_space(replace(problem, start=start(far)))
     used = time.process_time() - begun

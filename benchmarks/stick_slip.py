@@ -8,7 +8,7 @@ answers it, and `srf prove --report-only FOLDER` marks it.
 
 With `--limits` the truths are read, and the right model of each case is fitted from the file's start values and from others, A,
 B and D0 off by a quarter at random: the first steps of a fit, under one wide field after the other, as a fit chooses them. Each
-limit takes the place of FARTHEST_UPDATE, inf is none. Reached is what ends within NEAR of the likeliest maximum
+limit takes the place of MAX_UPDATE, inf is none. Reached is what ends within NEAR of the likeliest maximum
 that any of these finds.
 """
 
@@ -29,9 +29,9 @@ from common import Report
 from srfcli.core.errors import SrfError
 from srfcli.diagnosis.search import SEARCH_RTOL
 from srfcli.inference import state_space
-from srfcli.inference.state_space import SCORING_STEPS, Likelihood, from_any, wide_starts
+from srfcli.inference.state_space import SCORING_STEPS, Likelihood, maximise_from_starts, wide_starts
 from srfcli.validation import apparatus, cases
-from srfcli.validation.cases import Asked, Recipe, unseal
+from srfcli.validation.cases import CaseRequest, Recipe, unseal
 from srfcli.validation.trials import Trial, begin
 
 OFF = 0.25  # standard deviation of the logarithms of A, B and D0 in other starts
@@ -44,9 +44,9 @@ def drawn(trial: Path, n: int, seed: int) -> Trial:
     """Return the sealed trial of that folder, made of stick-slip alone if it is not there."""
     any_protocol, shares = cases.draw_wide, dict(apparatus.PROTOCOLS)
 
-    def draw_stick_slip(rng: np.random.Generator, asked: Asked) -> Recipe:
+    def draw_stick_slip(rng: np.random.Generator, asked: CaseRequest) -> Recipe:
         for number in range(2000):
-            recipe = any_protocol(rng, asked if number < 100 else Asked())
+            recipe = any_protocol(rng, asked if number < 100 else CaseRequest())
             if recipe.protocol == "stick-slip":
                 return recipe
         raise AssertionError("no stick-slip is drawn")
@@ -74,7 +74,7 @@ def fitted(case: tuple[Path, dict[str, Any], tuple[str, ...]]) -> Reached | str:
         starts.append(starts[0] | {n: file[n] * factor for n, factor in off.items()})
     found: Reached = {}
     for limit in limits:
-        setattr(state_space, "FARTHEST_UPDATE", min(float(limit), 1e12))  # noqa: B010
+        setattr(state_space, "MAX_UPDATE", min(float(limit), 1e12))  # noqa: B010
         found[limit] = [_reached(likelihood, start) for start in starts]
     return found
 
@@ -83,7 +83,7 @@ def _reached(likelihood: Likelihood, start: dict[str, float]) -> tuple[float, fl
     def quiet(text: str) -> None: ...
 
     since = time.process_time()
-    found = from_any(likelihood, wide_starts(likelihood, start, quiet), SCORING_STEPS // 2, quiet)
+    found = maximise_from_starts(likelihood, wide_starts(likelihood, start, quiet), SCORING_STEPS // 2, quiet)
     return found.point.log_likelihood if found else -np.inf, time.process_time() - since
 
 

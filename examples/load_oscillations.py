@@ -35,7 +35,7 @@ from srfcli.core.errors import SrfError
 from srfcli.core.units import split_quantity
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment
-from srfcli.diagnosis.goodness_of_fit import shortcomings
+from srfcli.diagnosis.goodness_of_fit import failed_tests
 from srfcli.inference.recordings import fit_recordings
 from srfcli.inference.state_space import log_evidence
 from srfcli.laws.registry import load_registry
@@ -236,7 +236,7 @@ def compare(options: argparse.Namespace, told: list[str] | None = None, *, model
         values = {n: (found.fit.values[n], float(spread[names.index(n)])) for n in names if n in found.fit.values}
         fits.append(
             Fitted(model, found.state_space.log_likelihood, log_evidence(found.state_space), values,
-                   tuple(shortcomings(found.state_space)))
+                   tuple(failed_tests(found.state_space)))
         )  # fmt: skip
     return sorted(fits, key=lambda f: -f.evidence)
 

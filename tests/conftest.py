@@ -30,7 +30,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 # Files of long tests, by their time: what takes longest is begun first, so that no worker is left alone with it at the end.
 LONG = (
-    "test_readme.py", "test_model_search.py", "test_fit_rough.py", "test_unknown.py", "test_misstated.py", "test_new.py",
+    "test_readme.py", "test_model_search.py", "test_fit_recordings.py", "test_unknown.py", "test_misstated.py", "test_new.py",
     "test_threshold_experiments.py", "test_notebooks.py", "test_report.py", "test_discriminating.py", "test_prove.py",
     "test_statespace.py", "test_api.py", "test_diagnose_command.py", "test_effects.py", "test_cli_commands.py",
     "test_simulate_command.py", "test_proof_bank.py", "test_kills.py", "test_proof_generator.py", "test_effect_plugins.py",
@@ -39,7 +39,7 @@ LONG = (
     "test_map.py", "test_packaging.py", "test_derive.py", "test_motion.py", "test_readers.py", "test_sample.py",
     "test_diagram.py", "test_paper.py", "test_parallel.py", "test_windows.py", "test_observables.py", "test_cache.py",
     "test_generate.py", "test_fit.py", "test_recording_real.py", "test_without_compiler.py", "test_locate.py",
-    "test_escapes.py", "test_folds.py", "test_trust.py", "test_architecture.py", "test_continuation.py",
+    "test_escapes.py", "test_map_folds.py", "test_trust.py", "test_architecture.py", "test_continuation.py",
     "test_simulate_field.py", "test_cli_frame.py",
 )  # fmt: skip
 

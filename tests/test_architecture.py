@@ -200,8 +200,8 @@ def test_a_constant_means_the_same_everywhere() -> None:
 def test_choices_of_light_commands_are_those_of_what_they_import_late() -> None:
     assert options.LOADINGS == system.LOADINGS
     assert cli_system.LONG_PARTS == derivation.EXTRAS
-    assert (cli_prove.KINDS, cli_prove.BANKS) == (cases.WIDE_KINDS, cases.BANKS)
-    assert set(cli_prove.TRACKS) == set(cases.TRACKS)
+    assert (cli_prove.CASE_KINDS, cli_prove.BANKS) == (cases.WIDE_KINDS, cases.BANKS)
+    assert set(cli_prove.TRACK_KINDS) == set(cases.TRACKS)
 
 
 def test_constants_in_the_docs_are_those_of_the_code() -> None:

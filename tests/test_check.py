@@ -122,7 +122,7 @@ def test_the_axes_of_what_is_imposed() -> None:
 
     t, W = np.arange(200.0), np.full(200, 5.0)
     run = {"name": "a", "t": t, "observed": t, "quantity": "x", "unit": "1", "used": t < 150, "load": lambda t: (W,)}
-    run |= {"load_unit": "N", "load_known": True, "proposed": None, "holdout": False}
+    run |= {"load_unit": "N", "load_known": True, "proposed": None, "drive_resets": (), "holdout": False}
     scales = {}
     for name, V in (("log", np.where(t < 9, 0.1, 10)), ("symlog", np.where(t < 9, -900.0, 2)), ("linear", t + 1e3)):
         recorded = SimpleNamespace(**run, drive=lambda t, V=V: V)

@@ -18,7 +18,7 @@ from commands import srf
 
 import srfcli
 from srfcli.core.errors import SrfError
-from srfcli.diagnosis.verdict import UNEXPLAINED
+from srfcli.diagnosis.verdict import PROB_UNREGISTERED_IF_PASSED
 from srfcli.results.diagnosis import prediction_names
 
 Ended = Callable[..., tuple[int, str, str]]
@@ -112,8 +112,9 @@ def test_the_concealed_effect_is_named_with_its_size(found: dict[str, Any]) -> N
     assert (found["verdict"], found["effects"]) == ("identified", ["linker-dieterich"])
     alpha = found["augmented"]["parameters"]["alpha"]
     assert abs(alpha["value"] - ALPHA) < 4 * alpha["stderr"] < 0.3 * ALPHA
-    assert found["confidence"]["linker-dieterich"] == pytest.approx(1 - UNEXPLAINED, abs=0.01)
-    assert found["confidence"]["unknown"] == pytest.approx(UNEXPLAINED, rel=0.05)  # something else may look like it
+    assert found["confidence"]["linker-dieterich"] == pytest.approx(1 - PROB_UNREGISTERED_IF_PASSED, abs=0.01)
+    # something else may look like it
+    assert found["confidence"]["unknown"] == pytest.approx(PROB_UNREGISTERED_IF_PASSED, rel=0.05)
     assert sum(found["confidence"].values()) == pytest.approx(1)
 
 

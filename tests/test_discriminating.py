@@ -15,23 +15,23 @@ import srfcli as srf
 from srfcli.cli.main import cli
 from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis.design import (
-    BEYOND_SHOWN,
-    TOLD_APART,
-    WORTH_MAKING,
+    DISCRIMINATING_GAIN,
+    EXTRAPOLATION_FACTOR,
+    MIN_DESIGN_GAIN,
     Design,
     DiscriminatingRun,
-    Loss,
+    LackOfFit,
     Proposal,
-    Side,
+    RivalModel,
     capabilities_of,
     described,
     discriminating_run,
     draw,
-    foremost,
-    led_in,
+    rival_models,
     run_of,
     sentences,
     vary,
+    with_fast_start,
 )
 from srfcli.diagnosis.hypotheses import Hypothesis
 from srfcli.diagnosis.verdict import Diagnosis
@@ -119,13 +119,13 @@ def test_the_case_is_ambiguous(diagnosis: Diagnosis) -> None:
 @pytest.mark.parametrize("true", RIVALS)
 def test_the_promise_is_kept(diagnosis: Diagnosis, found: DiscriminatingRun, true: str) -> None:
     """Made by the independent generator and refitted with the old runs: the gap is what was promised, within a factor of two."""
-    assert found.gain > 2 * TOLD_APART and found.gain == min(found.gains.values())
+    assert found.gain > 2 * DISCRIMINATING_GAIN and found.gain == min(found.gains.values())
     assert 0.5 < gap(diagnosis, found.proposal, true) / found.gains[true] < 2
 
 
 def test_a_poor_run_parts_nothing(diagnosis: Diagnosis) -> None:
     """Both effects are those of a load that changes: under a constant one nothing discriminates between them."""
-    design = Design(diagnosis.experiment, foremost(diagnosis), 0)
+    design = Design(diagnosis.experiment, rival_models(diagnosis), 0)
     trial = design.predict(POOR)
     assert trial is not None and trial.bound > 0
     judged = design.judge(trial)
@@ -139,7 +139,7 @@ def test_refits_do_not_part_by_a_poor_run_either(diagnosis: Diagnosis) -> None:
 
 def test_a_part_of_the_run_is_enough(diagnosis: Diagnosis, found: DiscriminatingRun) -> None:
     """The run cut to its first `seconds` promises 12, to half of that less."""
-    design = Design(diagnosis.experiment, foremost(diagnosis), 0)
+    design = Design(diagnosis.experiment, rival_models(diagnosis), 0)
     assert found.seconds is not None and found.repeats == 1 and 0 < found.seconds < found.proposal.duration
     gains = []
     for share in (1.0, 0.5):
@@ -150,7 +150,7 @@ def test_a_part_of_the_run_is_enough(diagnosis: Diagnosis, found: Discriminating
         trial = design.predict(replace(found.proposal, drive=tuple(drive)))
         assert trial is not None
         gains.append(design.gain(trial))
-    assert gains[1] < TOLD_APART * 0.9 and 0.8 * TOLD_APART < gains[0] < 2 * TOLD_APART
+    assert gains[1] < DISCRIMINATING_GAIN * 0.9 and 0.8 * DISCRIMINATING_GAIN < gains[0] < 2 * DISCRIMINATING_GAIN
 
 
 def test_the_difference_is_where_it_is_said_to_be(diagnosis: Diagnosis, found: DiscriminatingRun) -> None:
@@ -176,7 +176,7 @@ def test_one_class_is_said_to_be_one(diagnosis: Diagnosis) -> None:
     double = replace(first, hypothesis=Hypothesis((replace(effect, name="double", answers="double"),)))
     best = discriminating_run(SHIPPED, replace(diagnosis, close=(first, double, second)), tried=4, varied=1)
     assert best is not None and best.names == (first.name, "double", second.name)
-    assert best.gain < 1e-3 < WORTH_MAKING and not best.discriminates and best.repeats is None
+    assert best.gain < 1e-3 < MIN_DESIGN_GAIN and not best.discriminates and best.repeats is None
     assert "one class" in sentences(best)[0] and first.name in sentences(best)[0]
 
 
@@ -195,29 +195,29 @@ def test_the_gain_is_what_no_refit_absorbs(seed: int) -> None:
     w, X = rng.standard_normal(40), rng.standard_normal((40, 5)) * np.geomspace(0.1, 100, 5)
     root = rng.standard_normal((5, 5))
     Q = root @ root.T + 0.1 * np.eye(5)
-    lost = Loss(w, X, Q, w)
+    lost = LackOfFit(w, X, Q, w)
     covariance = np.eye(40) + X @ np.linalg.inv(Q) @ X.T
     assert lost.gain() == pytest.approx(0.5 * w @ np.linalg.solve(covariance, w), rel=1e-9)
-    twice = Loss(np.tile(w, 2), np.tile(X, (2, 1)), Q, w)
+    twice = LackOfFit(np.tile(w, 2), np.tile(X, (2, 1)), Q, w)
     assert lost.gain(times=2) == pytest.approx(twice.gain(), rel=1e-9)
     gains = [lost.gain(samples=k) for k in range(1, 41)]
     assert np.all(np.diff(gains) > -1e-12) and gains[-1] == pytest.approx(lost.gain())
     assert lost.gain() <= 0.5 * w @ w
-    assert Loss(X @ rng.standard_normal(5), X, 1e-9 * Q, w).gain() < 1e-6
+    assert LackOfFit(X @ rng.standard_normal(5), X, 1e-9 * Q, w).gain() < 1e-6
 
 
 def test_a_random_field_takes_its_share(diagnosis: Diagnosis, found: DiscriminatingRun) -> None:
     """What a rough track could do discriminates between nothing."""
     gains = []
     for amplitude in (0.0, 3e-4, 3e-3):
-        sides = []
-        for side in foremost(diagnosis):
-            values = {**side.fitted.fit.values, "field_amplitude": amplitude, "field_length": 6.0}
-            likelihood = Likelihood(side.problem, smooth=not amplitude, processes=side.fitted.fit.likelihood.processes)
+        rivals = []
+        for rival in rival_models(diagnosis):
+            values = {**rival.fitted.fit.values, "field_amplitude": amplitude, "field_length": 6.0}
+            likelihood = Likelihood(rival.problem, smooth=not amplitude, processes=rival.fitted.fit.likelihood.processes)
             point = likelihood.at(likelihood.coordinates(values))
-            fit = replace(side.fitted.fit, likelihood=likelihood, maximum=replace(side.fitted.fit.maximum, point=point))
-            sides.append(Side.of(replace(side.fitted, fit=fit)))
-        design = Design(diagnosis.experiment, sides, 0)
+            fit = replace(rival.fitted.fit, likelihood=likelihood, maximum=replace(rival.fitted.fit.maximum, point=point))
+            rivals.append(RivalModel.of(replace(rival.fitted, fit=fit)))
+        design = Design(diagnosis.experiment, rivals, 0)
         trial = design.predict(found.proposal)
         assert trial is not None
         gains.append(design.gain(trial))
@@ -233,11 +233,11 @@ def test_runs_stay_within_reach(diagnosis: Diagnosis, seed: int) -> None:
     apparatus, rng = capabilities_of(diagnosis.experiment), np.random.default_rng(seed)
     drawn = draw(apparatus, 24, rng)
     drawn += [v for p in drawn[:4] for v in vary(p, apparatus, 3, rng)]
-    drawn += [led for p in drawn[:12] if (led := led_in(p, apparatus)) is not None]
+    drawn += [led for p in drawn[:12] if (led := with_fast_start(p, apparatus)) is not None]
     assert {p.kind for p in drawn} == set(apparatus.kinds) == {"velocity steps", "slide-hold-slide", "modulation"}
     for p in drawn:
-        assert all(V == 0 or 6 / BEYOND_SHOWN <= V <= 40 * BEYOND_SHOWN for _, V in p.drive) and p.drive[0][1] > 0
-        assert 4 / BEYOND_SHOWN <= p.W0 <= 6 * BEYOND_SHOWN
+        assert all(V == 0 or 6 / EXTRAPOLATION_FACTOR <= V <= 40 * EXTRAPOLATION_FACTOR for _, V in p.drive) and p.drive[0][1] > 0
+        assert 4 / EXTRAPOLATION_FACTOR <= p.W0 <= 6 * EXTRAPOLATION_FACTOR
         assert sum(d * V for d, V in p.drive) < 1.02 * apparatus.travel and p.duration < 1.8
         if p.kind == "modulation":
             assert 0.074 <= p.eps <= 0.301 and 50 <= p.f <= 125 and 0 < p.onset < p.duration
@@ -249,17 +249,17 @@ def test_runs_stay_within_reach(diagnosis: Diagnosis, seed: int) -> None:
 
 def test_a_run_begins_in_stable_sliding(diagnosis: Diagnosis) -> None:
     """Where a nudge would grow, the run begins fast enough that none does; where none can, it is not proposed."""
-    design = Design(diagnosis.experiment, foremost(diagnosis), 0)
+    design = Design(diagnosis.experiment, rival_models(diagnosis), 0)
     calm = replace(POOR, drive=((1.0, 30.0),), W0=3.0)
     slow = replace(POOR, drive=((1.0, 3.0),), W0=9.0)
-    assert design.begun(calm) is not None and design.begun(calm)[0] == calm
-    led = design.begun(slow)
+    assert design.stably_started(calm) is not None and design.stably_started(calm)[0] == calm
+    led = design.stably_started(slow)
     assert led is not None and led[0].drive[0][1] == 40.0 and led[0].drive[1][1] == 3.0
-    assert design.begun(replace(slow, W0=100.0)) is None
+    assert design.stably_started(replace(slow, W0=100.0)) is None
     for proposal, grows in ((calm, False), (slow, True), (led[0], False)):
-        run, side = run_of(proposal, diagnosis.experiment), design.sides[0]
-        model = side.problem.model
-        p = run_parameters(model, side.problem.experiment, run, {**side.values(), "field_amplitude": 0.0})
+        run, rival = run_of(proposal, diagnosis.experiment), design.rivals[0]
+        model = rival.problem.model
+        p = run_parameters(model, rival.problem.experiment, run, {**rival.values(), "field_amplitude": 0.0})
         x = np.asarray(model.steady(p))
         nudged = x + 1e-4 * (np.array(model.states) == "ln_phi")
         V = Drive.constant(proposal.drive[0][1])
@@ -319,7 +319,7 @@ def test_words_and_numbers_agree(diagnosis: Diagnosis, found: DiscriminatingRun)
     assert f"{found.gain:.3g}" in whole and f"{found.seconds:.3g} s" in whole and f"{found.at:.3g} s" in whole
     assert ("above" in whole) == (found.peak > 0) != ("below" in whole)
     assert f"amplitude = {found.proposal.eps!r}" in told["run"] and told["run"].startswith("[[runs]]\n")
-    faint = replace(found, gain=2.0 * WORTH_MAKING, seconds=12.0, repeats=4)
+    faint = replace(found, gain=2.0 * MIN_DESIGN_GAIN, seconds=12.0, repeats=4)
     assert "in 4 such runs, 12 s in all" in sentences(faint)[1]
     assert "No number of repeats" in sentences(replace(faint, seconds=None, repeats=None))[1]
     force = sentences(replace(found, unit="N", noise=1e-9))[2]

@@ -14,7 +14,7 @@ from example_protocol import NOISE, example_protocol, rms
 
 from srfcli.codegen.model import open_model
 from srfcli.data.experiment import read_experiment
-from srfcli.inference.prediction import of_run, predict
+from srfcli.inference.prediction import effect_inputs, predict
 from srfcli.laws.registry import bundled_registry, load_registry
 from srfcli.motion.imposed import Modulation
 from srfcli.tasks.law_check import check_law
@@ -215,7 +215,7 @@ def test_onset_rise_and_phase_are_those_of_the_recorded_load(shared, onset, rise
     run = next(r for r in experiment.runs if r.name == "strong")
     envelope = (1 + np.tanh((run.t - onset) / rise)) / 2
     W = 7 * (1 + 0.2 * envelope * np.cos(2 * np.pi * 117.3 * run.t + phase))
-    found = of_run(replace(run, t=run.t.copy(), load=_Recorded(run.t, W)))
+    found = effect_inputs(replace(run, t=run.t.copy(), load=_Recorded(run.t, W)))
     assert found["modulated"] == 1.0
     assert found["f"] == pytest.approx(117.3, rel=1e-5)
     assert found["eps"] == pytest.approx(0.2, rel=1e-3)
@@ -239,7 +239,9 @@ def test_a_modulation_that_was_always_there_has_no_onset(shared):
     experiment = read_experiment(shared / "cases" / "open-01", registry=SHIPPED)
     runs = {r.name: r for r in experiment.runs}
     strong = runs["strong"]
-    found = of_run(replace(strong, t=strong.t.copy(), load=Modulation(7.0, 0.2, 110.0, phase=0.7)))
+    found = effect_inputs(replace(strong, t=strong.t.copy(), load=Modulation(7.0, 0.2, 110.0, phase=0.7)))
     assert (found["modulated"], found["onset0"]) == (1.0, -1e6)
     assert found["psi"] == pytest.approx(0.7, abs=1e-2)
-    assert {name: of_run(run)["modulated"] for name, run in runs.items()} == {name: float(bool(PLANS[name].eps)) for name in runs}
+    assert {name: effect_inputs(run)["modulated"] for name, run in runs.items()} == {
+        name: float(bool(PLANS[name].eps)) for name in runs
+    }

@@ -16,7 +16,7 @@ from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
 from srfcli.inference.fit import fit_problem
 from srfcli.inference.noise import Noise, difference_level, estimate_noise, lag_one, log_determinant, stretches, whiten
 from srfcli.inference.posterior import profile
-from srfcli.inference.prediction import basis, own_names, own_start, predict
+from srfcli.inference.prediction import basis, predict, run_specific_names, run_specific_start
 from srfcli.inference.recordings import fit_from_several
 from srfcli.inference.state_space import StateSpaceFit, as_fit, fit_state_space
 from srfcli.motion.imposed import ConstantLoad, Drive, Modulation
@@ -120,7 +120,7 @@ def test_levels_of_noise():
 def test_prediction_slopes(rock_model, observable, initial):
     experiment = rock(rock_model, observable=observable, initial=initial)
     run = experiment.runs[1]
-    by = ["mu0", "A", "D0", "K", *own_names(rock_model, run, "slip")]
+    by = ["mu0", "A", "D0", "K", *run_specific_names(rock_model, run, "slip")]
     values = ROCK_TRUE | {"K": 0.2, "r1.mu": 0.61, "r1.ln_phi": 0.4, "r1.trend": 2e-5}
     found = predict(rock_model, experiment, run, values, by=by, rtol=1e-9, trend="slip").J
     for k, name in enumerate(by):
@@ -210,7 +210,7 @@ def test_a_trend_may_be_as_steep_by_time_as_by_slip(rock_model):
     (run,) = rock(rock_model, runs=1).runs
     p = np.zeros(len(rock_model.names))
     for trend in ("slip", "time"):
-        start, lower, upper = own_start(rock_model, run, p, "r0.trend", trend)
+        start, lower, upper = run_specific_start(rock_model, run, p, "r0.trend", trend)
         assert start == 0.0 and lower == -upper
         assert upper * np.ptp(basis(run, trend)) == pytest.approx(10 * np.ptp(run.observed))
 
@@ -220,7 +220,7 @@ def test_a_run_may_begin_without_any_friction(rock_model, first):
     (run,) = rock(rock_model, runs=1).runs
     unloaded = replace(run, observed=run.observed - run.observed[0] + first, initial="free")
     unloaded.observed[:5] = first
-    mu, lower, upper = own_start(rock_model, unloaded, np.zeros(len(rock_model.names)), "r0.mu")
+    mu, lower, upper = run_specific_start(rock_model, unloaded, np.zeros(len(rock_model.names)), "r0.mu")
     assert mu == first and lower < mu - 0.09 and upper > mu + 0.09
 
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from srfcli.diagnosis.residual_scan import Location, Piece, ResidualScan, log_tail, stands_out
+from srfcli.diagnosis.residual_scan import Location, ResidualScan, RunResiduals, log_tail, significant_misfit
 
 N, STEP, FORCING = 1024, 0.002, 40.0
 RUNS = ("one", "two", "three")
 
 
-def design(n: int = N, seed: int = 5) -> list[Piece]:
+def design(n: int = N, seed: int = 5) -> list[RunResiduals]:
     """Return three runs of white residuals 0 with columns that are smooth and shared, v falling and phi wandering."""
     rng = np.random.default_rng(seed)
     t = STEP * np.arange(n)
@@ -26,18 +26,18 @@ def design(n: int = N, seed: int = 5) -> list[Piece]:
         X = np.column_stack([np.ones(n), V, t, np.sin(2 * np.pi * t)])
         coordinates = {"v": np.log(V) + 0.3 * np.sin(7 * t), "phi": phi, "W": W, "time": t}
         forcing = np.mod(FORCING * t, 1.0) if k else None
-        found.append(Piece(name, t, np.zeros(n), X, np.arange(4), ((0, n),), coordinates, forcing))
+        found.append(RunResiduals(name, t, np.zeros(n), X, np.arange(4), ((0, n),), coordinates, forcing))
     return found
 
 
-def located(pieces: list[Piece], signals: dict[str, np.ndarray], *, seed: int = 3, draws: int = 100) -> Location:
+def located(pieces: list[RunResiduals], signals: dict[str, np.ndarray], *, seed: int = 3, draws: int = 100) -> Location:
     """Return what is found in noise with signals, given in units of the noise's standard deviation."""
     rng, scan = np.random.default_rng(seed), ResidualScan(pieces, 4)
     residuals = []
     for p in pieces:
         e = rng.standard_normal(p.white.size)
         residuals.append(e + np.asarray(signals.get(p.name, np.zeros(p.white.size))))
-    return stands_out(scan, scan.projected(residuals), scan.null(draws, seed=1), {"two": FORCING, "three": FORCING})
+    return significant_misfit(scan, scan.projected(residuals), scan.null(draws, seed=1), {"two": FORCING, "three": FORCING})
 
 
 def test_noise_alone_is_nowhere() -> None:
@@ -156,7 +156,7 @@ def test_tails_go_on_where_probabilities_vanish() -> None:
 def test_a_parameter_that_moves_nothing_is_none() -> None:
     """Such as the length of a field that is not there: its error is infinite, and no recording is drawn with it."""
     pieces, rng = design(n=256), np.random.default_rng(3)
-    wider = [replace(p, X=np.column_stack([p.X, 1e-17 * rng.standard_normal(256)]), places=np.arange(5)) for p in pieces]
+    wider = [replace(p, X=np.column_stack([p.X, 1e-17 * rng.standard_normal(256)]), indices=np.arange(5)) for p in pieces]
     nulls = [ResidualScan(some, k, kept=True).null(40, seed=1) for some, k in ((pieces, 4), (wider, 5))]
     assert nulls[0] == pytest.approx(nulls[1], rel=1e-9)
 

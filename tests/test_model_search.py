@@ -13,12 +13,12 @@ from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import grouped
 from srfcli.data.values import FitParameter
 from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
-from srfcli.diagnosis.scores import Remainder, Scores
-from srfcli.diagnosis.search import MOST_EFFECTS, ModelSearch
+from srfcli.diagnosis.scores import ResidualProjection, Scores
+from srfcli.diagnosis.search import MAX_EFFECTS, ModelSearch
 from srfcli.diagnosis.verdict import conclude
 from srfcli.inference.state_space import (
-    DEVIATION,
-    NEEDED,
+    MAX_DEVIATION,
+    SIGNIFICANT_GAIN,
     Likelihood,
     StateSpaceFit,
     correlated,
@@ -177,7 +177,7 @@ def test_where_nothing_passes_the_models_after_the_best_are_expanded(ageing):
 
     search = Strict(SHIPPED, read_experiment(ageing, registry=SHIPPED, holdout=False), effects=FEW[:2])
     search.run()
-    singles = [f for f in search.fitted.values() if len(f.hypothesis.effects) < MOST_EFFECTS]
+    singles = [f for f in search.fitted.values() if len(f.hypothesis.effects) < MAX_EFFECTS]
     assert not search.best().passes and len(singles) > 2 and not search.cut_short
     assert all(f.scores for f in singles) and not search.queue
 
@@ -246,7 +246,7 @@ def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(experiment
     problem = Hypothesis().problem(SHIPPED, experiment)
     begun = Likelihood(problem)
     fitted = fit_state_space(problem, start=begun.values(begun.start), processes=(), close=1e3)
-    scores = Scores(SHIPPED, experiment, Remainder(fitted), (), candidates)
+    scores = Scores(SHIPPED, experiment, ResidualProjection(fitted), (), candidates)
     assert "slip-evolution" in {x.effect for x in scores.excluded}
     assert "closed form" in next(x.reason for x in scores.excluded if x.effect == "slip-evolution")
     assert {s.effect.reported for s in scores.singles} >= {"viscous-drag", "friction-drift"}
@@ -256,7 +256,7 @@ def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(experiment
 def test_scores_are_what_the_likelihood_gains_nearby(experiment, fitted, name):
     """The column of an effect against the likelihood of the model that has it, a little from its neutral value."""
     effect = SHIPPED.get("effect", name)
-    scores = Scores(SHIPPED, experiment, Remainder(fitted), (), [effect])
+    scores = Scores(SHIPPED, experiment, ResidualProjection(fitted), (), [effect])
     column = scores.columns[len(scores.columns) // 2]
     model = Hypothesis((effect,)).model(SHIPPED, experiment)
     longs = {p.name: long for long, p in own_parameters(effect, model).items()}
@@ -270,10 +270,10 @@ def test_scores_are_what_the_likelihood_gains_nearby(experiment, fitted, name):
         x[likelihood.names.index(longs[column.name])] = step  # beyond a bound too
         gained.append(likelihood.at(x, slopes=False).log_likelihood)
     slope = (gained[0] - gained[1]) / (2 * size)
-    first = float(column.columns[:, 0] @ scores.remainder.rest)
+    first = float(column.columns[:, 0] @ scores.projection.residuals)
     spread = np.sqrt(column.whole / column.columns.shape[1])  # standard deviation of the slope, the others' share in it
     assert abs(slope - first) < 0.15 * spread
-    along = scores.remainder.shifts(column.taken[:, 0])
+    along = scores.projection.shifts(column.coefficients[:, 0])
     moved = values | {n: fitted.values[n] + size * d for n, d in zip(fitted.likelihood.names, along, strict=True)}
     x = likelihood.coordinates(moved | {longs[column.name]: size})
     x[likelihood.names.index(longs[column.name])] = size
@@ -286,12 +286,12 @@ def test_scores_are_what_the_likelihood_gains_nearby(experiment, fitted, name):
 def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, fitted):
     """The gain of a shared field against a Gaussian density with its covariance written out, and its sign."""
     experiment = read_experiment(recorded(tmp_path, Physics(), shared=True), registry=SHIPPED, holdout=False)
-    remainder = Remainder(fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=()))
-    found = remainder.shared
-    assert found.gain > NEEDED > Remainder(fitted).shared.gain
+    projection = ResidualProjection(fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=()))
+    found = projection.shared
+    assert found.gain > SIGNIFICANT_GAIN > ResidualProjection(fitted).shared.gain
     absorbed = (found.u * found.absorbed) @ found.u.T  # I - inverse of the covariance
-    inverse = np.eye(remainder.left.size) - absorbed
-    gain = 0.5 * remainder.left @ absorbed @ remainder.left + 0.5 * np.linalg.slogdet(inverse)[1]
+    inverse = np.eye(projection.projected.size) - absorbed
+    gain = 0.5 * projection.projected @ absorbed @ projection.projected + 0.5 * np.linalg.slogdet(inverse)[1]
     assert gain == pytest.approx(found.gain, rel=1e-8)
 
 
@@ -302,10 +302,10 @@ def test_a_field_that_all_runs_share_counts_alike_under_every_model(tmp_path):
     assert found.effects == ("linker-dieterich",)
     random = [f for f in found.ranked if "track-topography" not in f.name]
     assert {"none", "linker-dieterich"} <= {f.name for f in random}
-    assert len({f.remainder.shared.gain for f in random}) > 1  # each its own
-    gain = found.best.remainder.shared.gain - NEEDED
-    assert gain > 0 and [f.evidence - f.separate for f in random] == pytest.approx([gain] * len(random))
-    assert all(f.evidence == f.separate for f in found.ranked if f not in random)
+    assert len({f.projection.shared.gain for f in random}) > 1  # each its own
+    gain = found.best.projection.shared.gain - SIGNIFICANT_GAIN
+    assert gain > 0 and [f.evidence - f.separate_field_evidence for f in random] == pytest.approx([gain] * len(random))
+    assert all(f.evidence == f.separate_field_evidence for f in found.ranked if f not in random)
 
 
 @pytest.mark.slow
@@ -318,7 +318,7 @@ def test_coloured_gauge_noise_is_not_taken_for_a_fine_field(tmp_path):
     drawn = {"field_amplitude": 3e-4, "field_length": 6.0 * np.sqrt(3)}
     other = fit_state_space(problem, start=drawn, processes=("relaxation",), smooth=False)
     assert found.log_likelihood > other.log_likelihood - 1.0
-    assert correlated(found.maximum.point) < DEVIATION
+    assert correlated(found.maximum.point) < MAX_DEVIATION
 
 
 def test_evidence_charges_for_what_is_free(fitted):

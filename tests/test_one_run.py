@@ -156,8 +156,8 @@ class Stuck(ModelSearch):
         problem = self._problem(Hypothesis(), {})
         likelihood = Likelihood(problem, processes=found.fit.likelihood.processes, rtol=SEARCH_RTOL)
         x = likelihood.coordinates({**found.fit.values, "D0": 0.25, "field_amplitude": 2e-3, "field_length": 0.3})
-        maximum = maximise(likelihood, x, held=["D0"], steps=8)
-        return self._judged(Hypothesis(), StateSpaceFit(likelihood, maximum, 1))
+        maximum = maximise(likelihood, x, fixed=["D0"], steps=8)
+        return self._assessed(Hypothesis(), StateSpaceFit(likelihood, maximum, 1))
 
 
 @needs_compiler

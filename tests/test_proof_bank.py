@@ -43,9 +43,9 @@ from srfcli.validation.cases import (
     known_rig,
     make_bank,
     make_case,
+    noiseless_record,
     plan_bank,
     seal,
-    unread,
     unseal,
 )
 from srfcli.validation.slider import Physics, Plan, move
@@ -82,7 +82,7 @@ def test_every_case_reads_back_and_gives_nothing_away(tmp_path, name):
         assert run.used.all()
         assert {n.kind for n in run.notices} <= ({"quantisation"} if truth["gauge"]["lag1"] else set())
         assert np.allclose(run.load.rest(0.0), plan.W0)
-        left = rms(run.observed - unread(known_rig(truth), acting(truth, plan), plan)) / NOISE
+        left = rms(run.observed - noiseless_record(known_rig(truth), acting(truth, plan), plan)) / NOISE
         assert 0.75 < left < 1.25
     text = b" ".join(contents(tmp_path / "c").values()).decode()
     assert not [n for n in (*NAMES, *OUTSIDE_NAMES, "effect", "rough", "seed") if n != "inertia" and n in text]
@@ -180,7 +180,7 @@ def test_a_case_of_the_wide_bank_reads_back(tmp_path, setting, noise):
     assert truth["effects"] == ([] if kind == "none" else ["ruina"]) and truth["kind"] == kind
     assert truth["accept"] == ([] if kind == "none" else ["slip-evolution"])
     for run, plan in zip(experiment.runs, known_plans(truth), strict=True):
-        made = unread(rig, acting(truth, plan), plan) * (rig.factor if rig.observes == "force" else 1.0)
+        made = noiseless_record(rig, acting(truth, plan), plan) * (rig.factor if rig.observes == "force" else 1.0)
         unit = gauge.louder(plan.loud).sigma * (rig.factor if rig.observes == "force" else 1.0)
         assert run.observable == rig.observes and np.allclose(run.t, plan.times(), atol=1e-6)
         assert 0.6 < rms((run.observed - made)[run.used]) / unit < 1.5  # 1/f noise of a short run wanders
@@ -236,7 +236,10 @@ def test_an_effect_in_one_run_leaves_the_others_alone(tmp_path):
     truth = make_case(tmp_path / "c", 4, **choice, rough=False, bank="wide")
     assert truth["verdict"] == "identified" and truth["accept"] == ["unknown"]
     rig, without = known_rig(truth), known_physics(truth, baseline=True)
-    moved = {plan.name: rms(unread(rig, acting(truth, plan), plan) - unread(rig, without, plan)) for plan in known_plans(truth)}
+    moved = {
+        plan.name: rms(noiseless_record(rig, acting(truth, plan), plan) - noiseless_record(rig, without, plan))
+        for plan in known_plans(truth)
+    }
     assert truth["only"] in ("first", "second") and moved[truth["only"]] > known_gauge(truth).sigma
     assert {name for name, change in moved.items() if change} == {truth["only"]}
     acts = {plan.name: acting(truth, plan) != known_physics(truth, baseline=True) for plan in known_plans(truth)}

@@ -17,7 +17,7 @@ import srfcli as srf
 from srfcli.data.experiment import read_experiment
 from srfcli.inference.prediction import predict
 from srfcli.laws.registry import load_registry
-from srfcli.validation.apparatus import LAW_NAMES, OF_LAW, RIGS, Setting, recorded, with_laws
+from srfcli.validation.apparatus import LAW_FIELDS, LAW_NAMES, RIGS, Setting, recorded, with_laws
 from srfcli.validation.cases import EFFECTS, NAMES, OUTSIDE, OUTSIDE_NAMES, case_files, draw_protocol
 from srfcli.validation.gauge import Gauge, autocovariance, play, read_gauge, white
 from srfcli.validation.slider import (
@@ -117,7 +117,7 @@ def predicted(make_model, folder, p, plan, rig, u, effects=(), **own):
         (folder / name).write_text(text)
     experiment = read_experiment(folder, registry=load_registry())
     model = make_model(**asdict(experiment.choice.plus(effects)), stability=False)
-    values = {LAW_NAMES.get(n, n): getattr(p, n) for n in (*OF_LAW[p.law_name], "lam", "nagata", "V0")}
+    values = {LAW_NAMES.get(n, n): getattr(p, n) for n in (*LAW_FIELDS[p.law_name], "lam", "nagata", "V0")}
     values = {n: v for n, v in {**values, "Vb": p.Vsat, **own}.items() if n in model.names}
     made = predict(model, experiment, experiment.runs[0], values, rtol=1e-9)
     assert made.status.ok

@@ -43,7 +43,18 @@ from srfcli.validation.blind import (
 )
 from srfcli.validation.cases import BANKS, NAMES, PAPER_KINDS, WIDE_KINDS, make_case, plan_bank, possible_pairs, variants
 from srfcli.validation.gauge import Gauge
-from srfcli.validation.marks import INVISIBLE, Rate, Sight, accepted, calibration, deviation, mark, quantile, see, stands_out
+from srfcli.validation.marks import (
+    MIN_VISIBLE_SIGMAS,
+    Detectability,
+    Rate,
+    accepted,
+    calibration,
+    detectability_of,
+    deviation,
+    effect_standard_errors,
+    grade,
+    quantile,
+)
 from srfcli.validation.slider import Physics, move
 from srfcli.validation.trials import Trial, answer_all, begin, open_truths, prove
 
@@ -92,7 +103,7 @@ def marked(truth, verdict, *names, sigmas=50.0, confidence=None, equivalent=(), 
         held={"a": {"baseline": 0.04, "augmented": held}, "b": {"baseline": 0.04, "augmented": held}},
     )  # fmt: skip
     stands = sigmas if isinstance(sigmas, dict) else dict.fromkeys(truth["effects"], sigmas)
-    return mark(truth, answer, Sight("case-000", {"a": 0.02, "b": 0.02}, stands))
+    return grade(truth, answer, Detectability("case-000", {"a": 0.02, "b": 0.02}, stands))
 
 
 ALPHA, DRAG, LAG = "linker-dieterich", "viscous-drag", "sensor-lag"
@@ -139,10 +150,10 @@ def test_ambiguous_counts_where_the_truth_is_listed_or_equivalent():
 
 
 def test_what_cannot_be_seen_is_not_asked_for():
-    weak = {"sigmas": INVISIBLE - 0.1}
+    weak = {"sigmas": MIN_VISIBLE_SIGMAS - 0.1}
     for verdict in ("none", "inconclusive", "ambiguous"):
         assert marked(truth_of(ALPHA), verdict, **weak).right
-        assert not marked(truth_of(ALPHA), verdict, sigmas=INVISIBLE).right
+        assert not marked(truth_of(ALPHA), verdict, sigmas=MIN_VISIBLE_SIGMAS).right
         assert not marked(truth_of(ALPHA), verdict, sigmas={ALPHA: None}).right  # not known to be invisible
     assert marked(truth_of(ALPHA), "identified", ALPHA, **weak).right
     assert not marked(truth_of(ALPHA), "identified", DRAG, **weak).right
@@ -176,7 +187,7 @@ def test_held_out_error_is_over_that_of_the_truth():
     m = marked(truth_of(ALPHA), "identified", ALPHA, held=0.022)
     assert (m.error, m.baseline_error) == (pytest.approx(1.1), pytest.approx(2.0))
     nothing = replace(m.answer, held={})
-    assert mark(truth_of(ALPHA), nothing, Sight("case-000", {"a": 0.02})).error is None
+    assert grade(truth_of(ALPHA), nothing, Detectability("case-000", {"a": 0.02})).error is None
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -205,7 +216,7 @@ def test_deviations_by_hand():
     assert off("friction-drift", 3.0, "1/um", drift_t=2.0) is None  # drift in time, found as one along the track
     assert off(ALPHA, 3.0, named=DRAG, alpha=2.0) is None
     found = replace(marked(truth_of(ALPHA), "identified", ALPHA), deviation=(-2.5, 0.1))
-    (row,) = report.sizes([found, replace(found, deviation=(1.5, 0.3))]).records()
+    (row,) = report.size_errors([found, replace(found, deviation=(1.5, 0.3))]).records()
     assert (row["within_2"], row["cases"]) == (1, 2)
     assert (row["median_off"], row["median_relative"]) == (2.0, pytest.approx(0.2))
 
@@ -294,7 +305,7 @@ def test_tables_count_what_was_marked():
     assert rows(report.by_outside(marks))["age-exponent"]["called"] == "slip-evolution"
     power = [r for r in report.by_strength(marks).records() if r["measure"] == "standard errors"]
     assert [(r["from"], r["cases"], r["seen"], r["named"]) for r in power] == [(5.0, 1, 1, 0), (50.0, 2, 2, 1)]
-    errors = rows(report.held(marks))["named rightly"]
+    errors = rows(report.held_out_errors(marks))["named rightly"]
     assert (errors["cases"], errors["median"], errors["within"], errors["baseline_median"]) == (1, pytest.approx(1.05), 1.0, 2.0)
     assert rows(report.calibrated(marks))
 
@@ -305,14 +316,14 @@ def test_an_effect_in_one_run_is_marked_by_its_name_and_by_its_run():
         Answer("c", "identified", (LAG,), run="strong"), Answer("c", "identified", (LAG,), run="steps"),
         Answer("c", "unknown", run="strong"), Answer("c", "identified", (DRAG,), run="strong"),
     ]  # fmt: skip
-    marks = [mark(truth, answer, Sight("c", sigmas={LAG: 90.0})) for answer in answers]
+    marks = [grade(truth, answer, Detectability("c", sigmas={LAG: 90.0})) for answer in answers]
     assert [(m.kind, m.right, m.located) for m in marks] == [
         ("one-run", True, True), ("one-run", True, False), ("one-run", True, False), ("one-run", False, False),
     ]  # fmt: skip
     found = rows(report.rates([*marks, marked(truth_of("ruina", kind="ageing"), "identified", "ruina")]))
     assert [found[f"effect in one run: named, {how}"]["hits"] for how in ("or unknown", "and the run")] == [3, 1]
     assert (found["ageing law named, where another is stated"]["hits"], len(marks)) == (1, 4)
-    everywhere = mark(truth_of(LAG), Answer("c", "identified", (LAG,)), Sight("c", sigmas={LAG: 90.0}))
+    everywhere = grade(truth_of(LAG), Answer("c", "identified", (LAG,)), Detectability("c", sigmas={LAG: 90.0}))
     assert everywhere.right and not everywhere.located
 
 
@@ -375,7 +386,7 @@ def test_an_effect_stands_out_by_what_the_baseline_cannot_do():
     plan, p = SHORT[1], replace(Physics(), drag=3e-5)
     gauge = Gauge(lag1=0.6)
     drag = variants("viscous-drag")[0]
-    left, raw = stands_out(drag, [], {plan: p}, gauge=gauge)
+    left, raw = effect_standard_errors(drag, [], {plan: p}, gauge=gauge)
 
     base = move(replace(p, drag=0.0), plan).u
     columns = [(move(p, plan).u - base) / p.drag]
@@ -398,7 +409,7 @@ def test_a_shift_of_a_free_parameter_does_not_stand_out():
     p = replace(Physics(), Wa=0.05)
     adhesion = variants("adhesion-offset")[0]
     for plan, most in ((steady, 0.2), (SHORT[1], np.inf)):
-        left, raw = stands_out(adhesion, [], {plan: p}, gauge=Gauge())
+        left, raw = effect_standard_errors(adhesion, [], {plan: p}, gauge=Gauge())
         assert left < most
         assert raw > 20
     assert left > 5  # a step of the load shows it
@@ -410,21 +421,21 @@ def test_a_wrong_stiffness_stands_out_of_elongations_by_the_mass_alone():
     stiffer, scaled = replace(p, ratio=r), replace(p, mu0=p.mu0 / r, A=p.A / r, B=p.B / r, lam=p.lam * r)
     plan, wrong = SHORT[1], variants("stiffness-error")[0]
     np.testing.assert_allclose(move(stiffer, plan).u, move(scaled, plan).u, rtol=1e-6)
-    left, raw = stands_out(wrong, [], {plan: stiffer}, gauge=Gauge())
+    left, raw = effect_standard_errors(wrong, [], {plan: stiffer}, gauge=Gauge())
     assert left < 1e-4 < 20 < raw
-    for mass, low, high in ((4e-6, INVISIBLE, np.inf), (4e-8, 0, 0.1)):  # a mass that shows, and one that does not
+    for mass, low, high in ((4e-6, MIN_VISIBLE_SIGMAS, np.inf), (4e-8, 0, 0.1)):  # a mass that shows, and one that does not
         heavy = {plan: replace(stiffer, massless=False, M=mass)}
-        assert low < stands_out(wrong, [], heavy, gauge=Gauge())[0] < high
-        assert stands_out(wrong, list(variants("inertia")), heavy, gauge=Gauge())[0] < 1e-3
+        assert low < effect_standard_errors(wrong, [], heavy, gauge=Gauge())[0] < high
+        assert effect_standard_errors(wrong, list(variants("inertia")), heavy, gauge=Gauge())[0] < 1e-3
     stress = Gauge(sigma=1e-3, quantum=1e-4)
-    force = stands_out(wrong, [], {plan: stiffer}, gauge=stress, rig=RIGS["rock-stress"])[0]
-    assert force > INVISIBLE  # a force is known, and a softer spring loads more slowly
+    force = effect_standard_errors(wrong, [], {plan: stiffer}, gauge=stress, rig=RIGS["rock-stress"])[0]
+    assert force > MIN_VISIBLE_SIGMAS  # a force is known, and a softer spring loads more slowly
 
 
 def test_the_true_model_leaves_the_noise(tmp_path):
     plans = (SHORT[1], replace(SHORT[0], holdout=True))
     truth = make_case(tmp_path / "c", 5, plans=plans, effects=[ALPHA, "friction-drift"], size=0.9, rough=2e-4)
-    found = see((tmp_path / "c", truth))
+    found = detectability_of((tmp_path / "c", truth))
     assert set(found.known) == {"wave"}  # the held-out run
     assert 0.85 < found.known["wave"] / np.hypot(0.02, 0.005 / np.sqrt(12)) < 1.15
     assert set(found.sigmas) == {ALPHA, "friction-drift"}
@@ -574,7 +585,7 @@ def test_kinds_of_a_bank():
     with pytest.raises(SrfError, match="no cases of the kind 'ageing'") as caught:
         plan_bank(5, 1, kinds=["ageing"])
     assert "--bank wide" in caught.value.hint
-    assert (command.KINDS, command.BANKS) == (WIDE_KINDS, BANKS)
+    assert (command.CASE_KINDS, command.BANKS) == (WIDE_KINDS, BANKS)
 
 
 def test_kinds_of_a_wide_bank():
@@ -654,7 +665,7 @@ def test_the_command_on_the_wide_bank(tmp_path, capsys):
     assert all("s of CPU" in answer.failure for answer in read_answers(Trial(folder).answers).values())
     data = json.loads((folder / "report.json").read_bytes())
     assert {m["kind"] for m in data["meta"]["marks"]} == {"none", "ageing"}
-    assert all(m["sigmas"] > INVISIBLE for m in data["meta"]["marks"] if m["kind"] == "ageing")
+    assert all(m["sigmas"] > MIN_VISIBLE_SIGMAS for m in data["meta"]["marks"] if m["kind"] == "ageing")
     found = {(r["circumstance"], r["value"]): r["cases"] for r in data["meta"]["settings"]}
     names = {"apparatus", "protocol", "friction law", "ageing law", "noise", "field"}
     assert {name: sum(n for (own, _), n in found.items() if own == name) for name, _ in found} == dict.fromkeys(names, 3)
@@ -718,6 +729,6 @@ def test_one_real_case_from_bank_to_mark(tmp_path):
     """A strong drift, told by nothing but its recordings."""
     truth = make_case(tmp_path / "case-000", 21, effects=["friction-drift"], size=0.9, rough=False)
     answer = answer_case(Task(tmp_path / "case-000", (), diagnose_case, 1800.0))
-    found = mark(truth, answer, see((tmp_path / "case-000", truth)))
+    found = grade(truth, answer, detectability_of((tmp_path / "case-000", truth)))
     assert (answer.failure, answer.verdict, found.right) == ("", "identified", True)
     assert found.error < 1.1 < found.baseline_error

@@ -23,8 +23,8 @@ from srfcli.laws.values import Effect
 from srfcli.results import report_text
 from srfcli.results.plots import figure_bytes
 from srfcli.results.report import command_lines, merged, write_report
-from srfcli.results.report_figures import close_up, foremost, local_rms, run_figure, spots, trace
-from srfcli.results.report_text import number, percent, probability, spans, with_error
+from srfcli.results.report_figures import close_up, foremost, local_rms, run_figure, scan_rows, trace
+from srfcli.results.report_text import format_with_error, number, percent, probability, spans
 from srfcli.results.tables import VOID, Markup, tag
 
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
@@ -443,7 +443,7 @@ def test_a_close_up_shows_where_and_how_fast_it_fails() -> None:
     ],
 )
 def test_values_have_the_digits_that_their_errors_allow(value: Any, error: Any, text: str) -> None:
-    assert with_error(value, error) == text
+    assert format_with_error(value, error) == text
 
 
 def test_numbers_have_sensible_digits() -> None:
@@ -464,14 +464,14 @@ def test_the_residual_scan_is_read_in_the_order_of_its_p_values() -> None:
     rows = [{"axis": axis, "run": "", "kind": "mean", "low": low, "high": high, "log_p": log_p, "p_value": p}
             for axis, low, high, log_p, p in (("v", 1.0, 2.0, -230.2585, 1e-90), ("v", 2.0, 3.0, -23.0, 1e-3),
                                               ("v", 3.0, 4.0, -1.0, 0.9), ("frequency", 119.5, 120.5, -50.0, 0.5))]  # fmt: skip
-    found = spots(rows, "MPa")
+    found = scan_rows(rows, "MPa")
     assert [round(s.height, 2) for s in found] == [100.0, 21.71, 9.99, 0.43]
     assert [s.place.replace("\u00a0", " ") for s in found[:2]] == ["1.00 to 2.00 µm/s", "120 Hz"]
     assert [s.sure for s in found] == [True, False, True, False]
     assert [s.axis for s in foremost(found, each=1)] == ["v", "frequency"]
-    (edge,) = spots([rows[0] | {"axis": "dlnW/dt", "low": -4.5e-15, "high": 35.8}], "MPa")
+    (edge,) = scan_rows([rows[0] | {"axis": "dlnW/dt", "low": -4.5e-15, "high": 35.8}], "MPa")
     assert edge.place.startswith("0 to 35.8")  # an end that rounding alone keeps from zero
-    (load,) = spots([rows[0] | {"axis": "W", "low": 58.0, "high": 72.0}], "MPa")
+    (load,) = scan_rows([rows[0] | {"axis": "W", "low": 58.0, "high": 72.0}], "MPa")
     assert load.place.replace("\u00a0", " ") == "58.0 to 72.0 MPa"
 
 

@@ -25,9 +25,9 @@ from srfcli.inference.state_space import (
     as_fit,
     filter_run,
     fit_state_space,
+    interrupted_fit,
     likeliest_end,
     maximise,
-    stopped,
     with_less_colour,
 )
 from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps, Modulation
@@ -564,7 +564,7 @@ def test_ctrl_c_keeps_the_likeliest_point_and_says_so(make_model, many):
     with pytest.raises(Interrupted) as caught:
         fit_state_space(problem, many=many, progress=stop)
     assert (caught.value.found.likelihood.problem is problem) == (many > 400)
-    likely = stopped(problem, caught.value.found)
+    likely = interrupted_fit(problem, caught.value.found)
     for name in ("A", "D0", "field_amplitude"):
         assert likely.values[name] == caught.value.found.values[name]
     white = [[f.values[n] for n in f.likelihood.names if "white" in n] for f in (likely, caught.value.found)]

@@ -22,7 +22,7 @@ from srfcli.core.errors import SrfError
 from srfcli.data.thresholds import Thresholds, thresholds_csv
 from srfcli.data.writing import write_experiment
 from srfcli.diagnosis.hypotheses import applicable
-from srfcli.diagnosis.verdict import held_out_loads, refusal
+from srfcli.diagnosis.verdict import held_out_loads, holdout_rejection
 from srfcli.inference.fit import fit_problem
 from srfcli.inference.free_parameters import free_parameters, with_transmission
 from srfcli.inference.state_space import Likelihood
@@ -531,7 +531,7 @@ def test_scores_are_the_slopes_of_critical_loads(diagnosed: tuple[Any, Path], ma
         scale = free_parameters(with_transmission(stable.parameters), ("A",), start={**stable.defaults(), **given})
         sides.append(Matcher(stable, table, values=given, scale=scale, tol=1e-9).match(np.zeros(1)).loads)
     raw = (sides[0] - sides[1]) / 2e-4 / table.sigma
-    assert column.columns[:, 0] == pytest.approx(base.remainder.free(raw), abs=1e-3 * float(np.abs(raw).max()))
+    assert column.columns[:, 0] == pytest.approx(base.projection.project(raw), abs=1e-3 * float(np.abs(raw).max()))
 
 
 def test_what_is_written_of_loads_alone_is_whole(diagnosed: tuple[Any, Path], empty_folder: Path) -> None:
@@ -548,11 +548,11 @@ def test_what_is_written_of_loads_alone_is_whole(diagnosed: tuple[Any, Path], em
 def test_held_out_loads_refuse_a_model_that_does_not_predict_them(diagnosed: tuple[Any, Path]) -> None:
     diagnosis = diagnosed[0].diagnosis
     best, baseline, whole = diagnosis.best, diagnosis.baseline, diagnosis.experiment
-    assert refusal((), [t.predicted for t in held_out_loads(baseline, best, whole)]) == ""
+    assert holdout_rejection((), [t.predicted for t in held_out_loads(baseline, best, whole)]) == ""
     loads = next(t for t in whole.thresholds if t.holdout)
     moved = replace(loads, table=replace(loads.table, W0c=1.15 * loads.table.W0c))
     wrong = held_out_loads(baseline, best, replace(whole, thresholds=(moved,)))
-    assert "held-out critical loads are not predicted: held has chi2" in refusal((), [t.predicted for t in wrong])
+    assert "held-out critical loads are not predicted: held has chi2" in holdout_rejection((), [t.predicted for t in wrong])
 
 
 def test_where_no_load_is_modulated_effects_on_modulation_cannot_be_seen(tmp_path: Path, measured: Thresholds) -> None:

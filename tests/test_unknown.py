@@ -19,11 +19,11 @@ from srfcli.diagnosis.discrepancy import (
     TERMS_FOLDER,
     ClosedForm,
     FittedTerm,
-    best_form,
-    coordinates_of,
+    best_closed_form,
+    correlation_ratios,
     explain_unknown,
-    unexplained_friction,
-    with_error,
+    format_with_error,
+    smoothed_friction_field,
     with_terms,
 )
 from srfcli.diagnosis.search import ModelSearch
@@ -69,7 +69,7 @@ def bump(tmp_path_factory):
     """Diagnosis and explanation of a bump of 0.004 on 14 um of the track."""
     p = replace(PLAIN, bump=0.004, bump_x=14.0, bump_w=1.2)
     search, diagnosis = searched(recorded(tmp_path_factory.mktemp("bump"), p, stated=PLAIN))
-    return diagnosis, explain_unknown(diagnosis, best_form(search, diagnosis))
+    return diagnosis, explain_unknown(diagnosis, best_closed_form(search, diagnosis))
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_terms_join_the_registry_and_give_way_to_a_registered_effect():
 def test_the_force_stands_where_the_track_is_rough(bump):
     """Found in both runs at that place, though neither place nor form is assumed."""
     diagnosis, _ = bump
-    found = unexplained_friction(diagnosis.baseline)
+    found = smoothed_friction_field(diagnosis.baseline)
     assert set(found) == {"steps", "down"}
     for run in found.values():
         top = int(np.argmax(run.force))
@@ -140,13 +140,13 @@ def test_the_force_stands_where_the_track_is_rough(bump):
         truth = 0.004 * np.exp(-0.5 * ((run.slip - 14.0) / 1.2) ** 2)
         assert np.corrcoef(run.force, truth)[0, 1] > 0.7
         assert np.mean((truth > run.low) & (truth < run.high)) > 0.8
-    assert next(iter(coordinates_of(found))) == "slip"
+    assert next(iter(correlation_ratios(found))) == "slip"
 
 
 def test_no_force_where_nothing_is_missing(tmp_path):
     _, diagnosis = searched(recorded(tmp_path, PLAIN, stated=PLAIN))
     assert diagnosis.verdict in ("none", "inconclusive")
-    found = unexplained_friction(diagnosis.baseline)
+    found = smoothed_friction_field(diagnosis.baseline)
     outside = [float(np.mean((r.low > 0) | (r.high < 0))) for r in found.values()]
     assert max(outside, default=0.0) < 0.05
 
@@ -247,14 +247,14 @@ def test_terms_together_are_one_effect(tmp_path):
     ],
 )
 def test_values_carry_two_digits_of_their_error(value, error, text):
-    assert with_error(value, error) == text
+    assert format_with_error(value, error) == text
 
 
 @pytest.mark.slow
 def test_a_form_that_cannot_be_fitted_beside_an_effect_is_tried_without_it(tmp_path):
     """A drag takes up a part of what ages differently; from where it stands the right term does not follow the recordings."""
     search, diagnosis = searched(recorded(tmp_path, replace(Physics(), p_age=1.7)))
-    found = best_form(search, diagnosis)
+    found = best_closed_form(search, diagnosis)
     assert found is not None and [t.effect.name for t in found.terms] == ["age-power"] and not found.beside
 
 

@@ -12,7 +12,16 @@ import pytest
 from srfcli.core.settings import Parameter
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, neutral_values
 from srfcli.diagnosis.scores import Score
-from srfcli.diagnosis.verdict import MISSED, TEMPER, UNEXPLAINED, Conclusion, Model, Predicted, interesting, judge
+from srfcli.diagnosis.verdict import (
+    CALIBRATION_TEMPERATURE,
+    PROB_REGISTERED_IF_UNKNOWN,
+    PROB_UNREGISTERED_IF_PASSED,
+    Conclusion,
+    Model,
+    PredictiveScore,
+    judge,
+    relevant_effect_size,
+)
 from srfcli.laws.registry import bundled_registry
 
 SHIPPED = bundled_registry()
@@ -28,8 +37,8 @@ def model(*names: str, evidence: float, passes: bool = True, run: str = "", **kn
     return Model(Hypothesis(effects), evidence, () if passes else ("a stretch of steps is off",), **known)
 
 
-def held(rms: float, gain: float = 1.0, size: int = 400, **known: Any) -> Predicted:
-    return Predicted("again", gain, rms, size, **known)
+def held(rms: float, gain: float = 1.0, size: int = 400, **known: Any) -> PredictiveScore:
+    return PredictiveScore("again", gain, rms, size, **known)
 
 
 def concluded(*models: Model, **found: Any) -> Conclusion:
@@ -71,7 +80,9 @@ def test_a_further_effect_that_gains_little_is_not_named():
 def test_models_that_do_equally_well_are_all_named():
     found = concluded(model("slip-evolution", evidence=101.0), model("viscous-drag", evidence=99.0), LOST)
     assert (found.verdict, set(found.effects)) == ("ambiguous", {"viscous-drag", "slip-evolution"})
-    assert found.confidence["slip-evolution"] / found.confidence["viscous-drag"] == pytest.approx(np.exp(2.0 / TEMPER))
+    assert found.confidence["slip-evolution"] / found.confidence["viscous-drag"] == pytest.approx(
+        np.exp(2.0 / CALIBRATION_TEMPERATURE)
+    )
     assert sum(found.confidence.values()) == pytest.approx(1)
 
 
@@ -121,7 +132,7 @@ def test_held_out_runs_refuse(runs, verdict):
     [((1.0, 1.0), 0.9, ""), ((1.0, 1.0), 1.1, "table has chi2 90.0"), ((-4.0, -3.0), 0.9, "worse than by the baseline")],
 )
 def test_held_out_critical_loads_refuse(gains, excess, said):
-    loads = [Predicted("table", gains[1], 3.0, 10, excess=excess)]
+    loads = [PredictiveScore("table", gains[1], 3.0, 10, excess=excess)]
     found = concluded(DRAG, LOST, held=[held(1.0, gain=gains[0])], loads=loads)
     assert (found.verdict, found.ungated) == ("unknown" if said else "identified", "identified")
     assert said in found.reasons[-1]
@@ -134,9 +145,11 @@ def test_a_baseline_that_passes_is_refused_by_held_out_runs_too():
 def test_a_model_far_off_has_no_share_of_the_confidence():
     found = concluded(replace(DRAG, against=("innovations are correlated",)), LOST)
     assert found.verdict == "unknown" and found.confidence["viscous-drag"] == 0.0
-    assert found.confidence["unknown"] == pytest.approx(1 - MISSED) and found.confidence["missed"] == pytest.approx(MISSED)
+    assert found.confidence["unknown"] == pytest.approx(1 - PROB_REGISTERED_IF_UNKNOWN) and found.confidence[
+        "missed"
+    ] == pytest.approx(PROB_REGISTERED_IF_UNKNOWN)
     sure = concluded(DRAG, LOST)
-    assert sure.confidence["unknown"] == pytest.approx(UNEXPLAINED, rel=0.05)
+    assert sure.confidence["unknown"] == pytest.approx(PROB_UNREGISTERED_IF_PASSED, rel=0.05)
 
 
 def test_effects_of_one_signal_are_one_class():
@@ -179,7 +192,7 @@ def test_an_interesting_size_is_in_base_units():
     own = SHIPPED.get("effect", "sensor-lag")
     (name,) = own.sizes
     in_ms = replace(own, parameters=(Parameter(name, 3.0, "ms", 0.0, 100.0),), neutral=((name, 1.0),))
-    assert interesting(replace(score("sensor-lag", 1.0), effect=in_ms)) == pytest.approx(0.002)
+    assert relevant_effect_size(replace(score("sensor-lag", 1.0), effect=in_ms)) == pytest.approx(0.002)
     assert neutral_values(in_ms) == {name: pytest.approx(0.001)}
 
 
@@ -209,7 +222,11 @@ def test_held_out_runs_choose_between_models_that_fit_equally_well(told, said):
         model("slip-evolution", evidence=100.0, held_out=-30.0), model("viscous-drag", evidence=98.0, held_out=told - 30.0), LOST
     )
     assert (found.verdict, found.effects) == said
-    assert found.confidence["viscous-drag"] > 0.99 * (1 - UNEXPLAINED) if told else found.confidence["slip-evolution"] > 0.5
+    assert (
+        found.confidence["viscous-drag"] > 0.99 * (1 - PROB_UNREGISTERED_IF_PASSED)
+        if told
+        else found.confidence["slip-evolution"] > 0.5
+    )
 
 
 def test_models_that_held_out_runs_do_not_tell_apart_where_none_is_followed_are_told_apart_by_the_rest():
@@ -217,7 +234,9 @@ def test_models_that_held_out_runs_do_not_tell_apart_where_none_is_followed_are_
         model("slip-evolution", evidence=100.0, held_out=-np.inf), model("viscous-drag", evidence=90.0, held_out=-np.inf), LOST
     )
     assert (found.verdict, found.effects) == ("identified", ("slip-evolution",))
-    assert found.confidence["slip-evolution"] == pytest.approx((1 - UNEXPLAINED) / (1 + np.exp(-10.0 / TEMPER)), rel=1e-3)
+    assert found.confidence["slip-evolution"] == pytest.approx(
+        (1 - PROB_UNREGISTERED_IF_PASSED) / (1 + np.exp(-10.0 / CALIBRATION_TEMPERATURE)), rel=1e-3
+    )
 
 
 def test_held_out_runs_may_choose_a_model_that_fits_worse():

@@ -123,7 +123,7 @@ def _boundary_output(boundary: str, output: options.OutputOptions) -> options.Ou
 
 # The axes of a map: parameters, or ratios of two such as K/W0.
 
-COLUMNS, ROWS = 80, 120  # points of an axis for which none were given
+DEFAULT_COLUMNS, DEFAULT_ROWS = 80, 120  # points of an axis for which none were given
 
 
 def read_axes(model: GeneratedModel, base: Array, over: tuple[options.Range, ...]) -> tuple[MapAxis, MapAxis]:
@@ -133,7 +133,7 @@ def read_axes(model: GeneratedModel, base: Array, over: tuple[options.Range, ...
     """
     if len(over) > 2:
         raise SrfError(f"--over is given {len(over)} times", "A map has two axes: --over V=1:100:120 --over K/W0=0.005:0.03:200.")
-    ranges = over or (replace(options.parse_over("V=1:100"), n=COLUMNS),)
+    ranges = over or (replace(options.parse_over("V=1:100"), n=DEFAULT_COLUMNS),)
     x, *others = [read_axis(model, r) for r in ranges]
     return x, others[0] if others else _load_axis(model, base, x)
 
@@ -171,9 +171,9 @@ def _load_axis(model: GeneratedModel, base: Array, x: MapAxis) -> MapAxis:
     window = found_window(model, [model.with_values(base, **{x.moved: value}) for value in values])
     lo, hi = window.lo, window.hi
     if "K" in (x.moved, x.held):
-        return MapAxis("W0", lo, hi, ROWS)
+        return MapAxis("W0", lo, hi, DEFAULT_ROWS)
     K = float(base[model.index("K")])
-    return MapAxis("W0", K / hi, K / lo, ROWS, True, "K")
+    return MapAxis("W0", K / hi, K / lo, DEFAULT_ROWS, True, "K")
 
 
 # `srf compare`: the stability diagrams of several laws, each brought to the same observables at one low velocity.

@@ -21,9 +21,9 @@ srf prove --cases 40 --track rough --out rough             a random friction fie
 srf prove --bank wide --cases 60 --workers 0 --out wide    rock, micro-tribometers, other laws, protocols and noise, too
 srf prove --report-only proof --json | jq .meta.rates      the tables again
 """
-KINDS = ("none", "single", "pair", "outside", "ageing", "one-run")
+CASE_KINDS = ("none", "single", "pair", "outside", "ageing", "one-run")
 BANKS = ("paper", "wide")
-TRACKS = ("smooth", "rough", "shared")
+TRACK_KINDS = ("smooth", "rough", "shared")
 
 
 @click.command("prove", cls=SrfCommand, epilog=EXAMPLES)
@@ -33,7 +33,7 @@ TRACKS = ("smooth", "rough", "shared")
     "--kind",
     "kinds",
     multiple=True,
-    type=click.Choice(KINDS),
+    type=click.Choice(CASE_KINDS),
     help="Make cases of this kind only; may be given several times. ageing and one-run are in the wide bank.",
 )
 @click.option(
@@ -43,7 +43,7 @@ TRACKS = ("smooth", "rough", "shared")
 )
 @click.option(
     "--track",
-    type=click.Choice(TRACKS),
+    type=click.Choice(TRACK_KINDS),
     help="Random friction field of the cases: none, one that all runs share, or one of each run's own.",
 )
 @click.option("--workers", type=click.IntRange(0, 4096), default=1, help="Processes, 0 for all cores.")

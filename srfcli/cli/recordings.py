@@ -98,7 +98,7 @@ def new(files: tuple[Path, ...], out: str | None, force: bool, plugins: tuple[Pa
 def _asked(path: Path, columns: dict[str, str], options: dict[str, Any], registry: Registry) -> dict[str, Any]:
     """Ask for the drive, load and stiffness that neither the first file nor the options say; columns go into `columns`."""
     from srfcli.data.columns import open_source
-    from srfcli.data.draft import OBSERVED, missing, name_columns
+    from srfcli.data.draft import OBSERVED_ROLES, missing, name_columns
 
     drive, load, stiffness = options["drive"], options["load"], options["stiffness"]
     headings = open_source(path, registry=registry, format=options["reader"]).headings
@@ -111,7 +111,7 @@ def _asked(path: Path, columns: dict[str, str], options: dict[str, Any], registr
         if option.startswith("`columns` time"):
             columns["time"] = click.prompt(f"{sentence}. Time", err=True)
         elif option.startswith("`columns`"):
-            role = click.prompt(f"{sentence}.\nWhat was observed", err=True, type=click.Choice(OBSERVED[::-1]))
+            role = click.prompt(f"{sentence}.\nWhat was observed", err=True, type=click.Choice(OBSERVED_ROLES[::-1]))
             columns[role] = click.prompt("In the column", err=True)
         elif option.startswith("`drive`"):
             drive = click.prompt(f"{sentence}. Velocity in um/s, or duration:velocity, ...", err=True)

@@ -17,7 +17,7 @@ from srfcli.results.tables import Column, Table
 
 # `srf config`: which values a command would use, and who set them.
 
-COLUMNS = (
+CONFIG_COLUMNS = (
     Column("name", "", "choice or parameter"),
     Column("value", "", "in its declared unit", format=".12g"),
     Column("unit", "", "declared unit"),
@@ -60,7 +60,7 @@ def show(system: SystemOptions, output: OutputOptions) -> None:
     for p in built.parameters:
         rows.append((p.name, resolved.declared[p.name], p.unit, resolved.origins[p.name], p.about or None))
     notes = (f"settings file: {system.toml.path}",) if system.toml.path else ()
-    emit(Table("srf.config/1", COLUMNS, rows, built.title, notes, resolved.described()), output, laws=built.laws)
+    emit(Table("srf.config/1", CONFIG_COLUMNS, rows, built.title, notes, resolved.described()), output, laws=built.laws)
 
 
 # `srf derive`: what follows from a law by algebra, and the paper's equations held against it.

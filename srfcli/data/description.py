@@ -26,7 +26,7 @@ from srfcli.core.units import (
 from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Declared
 from srfcli.motion.imposed import RISE
 
-FORMAT = "srf-experiment/1"
+EXPERIMENT_FORMAT = "srf-experiment/1"
 DESCRIPTION = "experiment.toml"
 ROLES = {  # what a column may be, and the unit of a number in it where neither heading nor [columns] say
     "time": "s",
@@ -137,11 +137,11 @@ def read_description(path: Path) -> Description:
     file = find_file(path)
     root = open_node(file)
     declared = root.get("format")
-    start = f'Start the file with format = "{FORMAT}".'
+    start = f'Start the file with format = "{EXPERIMENT_FORMAT}".'
     if declared is None:
-        raise SrfError(f"{file}: format: missing, expected {FORMAT!r}", start)
-    if declared.value != FORMAT:
-        declared.expected(f'"{FORMAT}"', start)
+        raise SrfError(f"{file}: format: missing, expected {EXPERIMENT_FORMAT!r}", start)
+    if declared.value != EXPERIMENT_FORMAT:
+        declared.expected(f'"{EXPERIMENT_FORMAT}"', start)
     root.keys(("format", "title", "apparatus", "model", "parameters", "columns", "runs", "thresholds"))
     apparatus = root.require("apparatus", '[apparatus] with stiffness = "0.21 N/um".').table("[apparatus].")
     machine = _apparatus(apparatus)

@@ -26,7 +26,7 @@ from srfcli.core.units import (
     unit_factor,
 )
 from srfcli.data.columns import DRIVES, Columns, goes_backward, open_source, read_columns
-from srfcli.data.description import FORMAT, GEOMETRY, ROLES, check_unit, read_description
+from srfcli.data.description import EXPERIMENT_FORMAT, GEOMETRY, ROLES, check_unit, read_description
 from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.groups import levels
 from srfcli.data.imposed import LOADS, StartsAtRest, Stroke, find_modulation, strokes
@@ -57,7 +57,7 @@ NAMED = {  # role -> what headings call it, in small letters without their unit;
         "fnorm",
     ),
 }  # fmt: skip
-WORDS = {  # role -> words of a heading that mean it, where no heading is one of NAMED
+HEADING_WORDS = {  # role -> words of a heading that mean it, where no heading is one of NAMED
     "time": {"time", "elapsed", "clock", "timestamp"},
     "load_point_velocity": {"velocity", "vel", "speed", "rate", "rpm", "sliding", "v", "vs", "rotation", "angular"},
     "load_point_displacement": {
@@ -73,13 +73,13 @@ WORDS = {  # role -> words of a heading that mean it, where no heading is one of
     },
     "friction": {"friction", "mu", "cof", "coefficient", "coeff"},
 }  # fmt: skip
-KINDS = {  # role -> kinds of units that a column called so has
+UNIT_KINDS = {  # role -> kinds of units that a column called so has
     "time": {"s"}, "load_point_velocity": {"um/s", "rad/s", "1/s"}, "load_point_displacement": {"um", "rad", "1"},
     "normal_load": {"N"}, "normal_stress": {"MPa", "N"}, "force": {"N", "N*um"}, "shear_stress": {"MPa", "N", "N*um"},
     "friction": {"1"}, "elongation": {"um"},
 }  # fmt: skip
 NOT_EACH = {"max", "maximum", "peak", "nominal", "set"}  # of a velocity that is not that of each sample
-ALONE = {"time": {"s"}, "load_point_velocity": {"um/s", "rad/s"}, "shear_stress": {"N*um"}}  # units that tell a role alone
+ROLE_UNITS = {"time": {"s"}, "load_point_velocity": {"um/s", "rad/s"}, "shear_stress": {"N*um"}}  # units that tell a role alone
 ASIDE = {"thickness", "gap", "height", "dilation", "dilatancy", "compaction", "depth", "pore", "confining", "temperature", "temp",
          "humidity", "std", "error", "setpoint", "target", "command", "raw", "pz", "zpos"}  # fmt: skip
 UNIT_SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
@@ -89,7 +89,7 @@ UNIT_SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
 }  # fmt: skip
 STRESS_OF = {"normal_load": "normal_stress", "force": "shear_stress", "friction": "shear_stress"}
 FORCE_OF = {"normal_stress": "normal_load", "shear_stress": "force", "friction": "force"}
-OBSERVED = ("elongation", "force", "shear_stress", "friction")
+OBSERVED_ROLES = ("elongation", "force", "shear_stress", "friction")
 MISREAD = ("friction", "drive-smoothed")  # kinds of notices that mean that the file was misread, or is not what it seems
 NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
 HOLD_SPEED = 0.05  # of the slowest sliding, below which is a hold
@@ -198,7 +198,7 @@ def name_columns(
         found[actual] = Named(actual, heading, unit or ROLES[actual], said, unit is None)
         taken.add(heading)
     _by_words(headings, found)
-    seen = [role for role in (OBSERVED if not per_load else OBSERVED[::-1]) if role in found]
+    seen = [role for role in (OBSERVED_ROLES if not per_load else OBSERVED_ROLES[::-1]) if role in found]
     asked = [role for role in seen if role in wish]
     left = set(seen) - set((asked or seen)[:1])
     left |= {"load_point_displacement"} if "load_point_velocity" in found else set()
@@ -218,18 +218,18 @@ def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
     units_of = {h: "1" if unit is None and "strain" in words[h] else unit for h, unit in units_of.items()}
     kinds = {h: _kind_of_unit(unit) for h, unit in units_of.items()}
     free = [h for h in kinds if not words[h] & ASIDE]
-    for role, known in WORDS.items():
-        if role in found or any(role in same and {*same} & found.keys() for same in (DRIVES, LOADS, OBSERVED)):
+    for role, known in HEADING_WORDS.items():
+        if role in found or any(role in same and {*same} & found.keys() for same in (DRIVES, LOADS, OBSERVED_ROLES)):
             continue  # it, or another that makes it needless, is found already
         # a unit that is not told will do for a role that is told by a number without one
-        fit = [h for h in free if kinds[h] in KINDS[role] or (kinds[h] == "" and role == "time")]
+        fit = [h for h in free if kinds[h] in UNIT_KINDS[role] or (kinds[h] == "" and role == "time")]
         score = {h: len(words[h] & known) for h in fit}
         if role == "normal_stress":  # a normal displacement is told by its unit, a shear stress by its word
-            score = {h: 0 if words[h] & WORDS["shear_stress"] else n for h, n in score.items()}
+            score = {h: 0 if words[h] & HEADING_WORDS["shear_stress"] else n for h, n in score.items()}
         best = max(score.values(), default=0)
         named = [h for h in fit if score[h] == best > 0]
-        if not best and role in ALONE:
-            named = [h for h in fit if kinds[h] in ALONE[role]]
+        if not best and role in ROLE_UNITS:
+            named = [h for h in fit if kinds[h] in ROLE_UNITS[role]]
         if len(named) == 1:
             heading = named[0]
             actual = _as_force(role, kinds[heading])
@@ -282,7 +282,7 @@ def _by_unit(role: str, unit: str | None) -> str | None:
         return role
     kind = _kind_of_unit(unit)
     actual = _as_force(role, kind)
-    return actual if kind in KINDS[actual] else None
+    return actual if kind in UNIT_KINDS[actual] else None
 
 
 def _as_force(role: str, kind: str) -> str:
@@ -302,7 +302,7 @@ def missing(
     lacks = []
     if "time" not in roles:
         lacks.append(("`columns` time=HEADING", f"{path}: which column is the time? It has {listed}"))
-    if not roles & set(OBSERVED):
+    if not roles & set(OBSERVED_ROLES):
         what = "friction, shear stress, force or elongation of the spring"
         kinds = {_kind_of_unit(_spelled(h)[1]) for h in headings}
         role = "force" if "N" in kinds and "MPa" not in kinds else "shear_stress"
@@ -327,7 +327,7 @@ def _another_drive(columns: Sequence[Named], aside: Sequence[str]) -> list[str]:
     """Return what to say of a velocity whose heading names a largest or a set one, where a way was left aside."""
     drive = next((c.heading for c in columns if c.role == "load_point_velocity"), "")
     words = {h: set(re.findall(r"[a-z]+", _spelled(h)[0])) for h in (drive, *aside)}
-    ways = [h for h in aside if _kind_of_unit(_spelled(h)[1]) == "um" and words[h] & WORDS["load_point_displacement"]]
+    ways = [h for h in aside if _kind_of_unit(_spelled(h)[1]) == "um" and words[h] & HEADING_WORDS["load_point_displacement"]]
     if not (ways and words[drive] & NOT_EACH):
         return []
     said = f"the drive is '{drive}', which may not be the velocity at each sample; '{ways[0]}' was left aside"
@@ -465,7 +465,7 @@ def _signs(columns: Columns, turning: bool) -> dict[str, int]:
     arrays, found = columns.arrays, {}
     if (load := columns.role(*LOADS)) is not None:
         found[load] = -1 if np.nanmax(arrays[load]) < 0 else 1
-    observed, drive = columns.role(*OBSERVED), columns.role(*DRIVES)
+    observed, drive = columns.role(*OBSERVED_ROLES), columns.role(*DRIVES)
     if observed is None or turning:
         return found
     if not np.any(arrays[observed]):
@@ -518,7 +518,7 @@ class _Sketch:
         """Return the whole file."""
         wish = self.wish
         lines = [
-            f"format = {toml_value(FORMAT)}",
+            f"format = {toml_value(EXPERIMENT_FORMAT)}",
             f"title = {toml_value(wish.title or ', '.join(self.names))}",
             *("", f"# Letters: {LETTERS}.", "", "[apparatus]"),
             f"stiffness = {toml_value(wish.stiffness)}   # of the machine: N/um, MPa/mm, or 1/um for friction per micron",
@@ -711,4 +711,4 @@ def looks_like_recording(path: Path, *, registry: Registry) -> bool:
     except SrfError:
         return False
     roles = {n.role for n in name_columns(headings, {}, path=path, per_load=False)}
-    return "time" in roles and bool(roles & set(OBSERVED))
+    return "time" in roles and bool(roles & set(OBSERVED_ROLES))

@@ -733,7 +733,7 @@ NEGLIGIBLE = 1e-5  # of the load's range: noise below it is interpolated and not
 SELDOM = 100  # samples to each that differs from the one before, from which a load was set, and what is between has no noise
 LOAD_BLOCKS = 16  # whose means are compared to see whether a load is constant
 ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
-APART = 2.0  # times as far from its level as the next sample: a spike; the tail of a noise of 4 degrees of freedom has 7 %
+SPIKE_RATIO = 2.0  # times as far from its level as the next sample: a spike; the tail of a noise of 4 degrees of freedom has 7 %
 NO_CONTACT = 1e-15  # N: no contact
 PRESSED = 0.5  # of the median load: above it the slider is pressed on
 SAMPLES_A_PERIOD = 8  # of a modulation, from which a column shows it to 1e-3 of its amplitude
@@ -799,7 +799,7 @@ def load_from_column(place: Place, W: Array, unit: str = "N") -> tuple[Load, lis
     if bad.any():  # less is the tail of a noise: those that stand out, each no more than twice as far as the next
         off = deviations(filled)
         ranked = np.sort(off)[::-1]
-        count = np.flatnonzero((ranked[:-1] >= APART * ranked[1:]) & (np.arange(1, off.size) <= bad.sum()))
+        count = np.flatnonzero((ranked[:-1] >= SPIKE_RATIO * ranked[1:]) & (np.arange(1, off.size) <= bad.sum()))
         bad &= off >= ranked[count[-1]] if count.size else False
     notices += place.spots("spike", bad, f"standing out in '{place.heading}'; the load is bridged")
     good = known & ~bad

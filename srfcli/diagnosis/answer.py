@@ -11,8 +11,8 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.data.values import CriticalLoads, Run
 from srfcli.diagnosis.design import DiscriminatingRun, described
-from srfcli.diagnosis.discrepancy import unexplained_friction
-from srfcli.diagnosis.residual_scan import Location, Row
+from srfcli.diagnosis.discrepancy import smoothed_friction_field
+from srfcli.diagnosis.residual_scan import Location, ScanStatistic
 from srfcli.diagnosis.verdict import Diagnosis, parameters_of
 from srfcli.inference.state_space import Filtered
 
@@ -42,9 +42,9 @@ class RunView:
 
 def run_views(diagnosis: Diagnosis) -> tuple[RunView, ...]:
     """Return every run under baseline and augmented model, fitted ones first."""
-    before, after = diagnosis.shown.fit.maximum.point.runs, diagnosis.best.fit.maximum.point.runs
+    before, after = diagnosis.reported_baseline.fit.maximum.point.runs, diagnosis.best.fit.maximum.point.runs
     same = diagnosis.best is diagnosis.baseline
-    held = ((h.shown, h.shown if same else h.augmented) for h in diagnosis.held)
+    held = ((h.reported_baseline, h.reported_baseline if same else h.augmented) for h in diagnosis.held)
     return tuple(_view(b, a) for b, a in (*zip(before, after, strict=True), *held))
 
 
@@ -62,12 +62,14 @@ def answer(diagnosis: Diagnosis, location: Location, *, discriminating: Discrimi
     views, loads, last = run_views(diagnosis), load_views(diagnosis), diagnosis.best
     held: list[RunView | LoadView] = [*(v for v in views if v.run.holdout), *(v for v in loads if v.loads.holdout)]
     sides = {}
-    for place, (name, fitted, own) in enumerate((("baseline", diagnosis.shown, diagnosis.baseline), ("augmented", last, last))):
+    for place, (name, fitted, own) in enumerate(
+        (("baseline", diagnosis.reported_baseline, diagnosis.baseline), ("augmented", last, last))
+    ):
         values = own.fit.values
         sides[name] = {
             "parameters": parameters_of(fitted),
             "fit": {"rms_over_noise": fitted.fit.maximum.point.rms},
-            "holdout": {"rms_over_noise": together(held, place)},
+            "holdout": {"rms_over_noise": pooled_rms(held, place)},
             "field": None if own.fit.smooth else {"amplitude": values["field_amplitude"], "length_um": values["field_length"]},
         }
     found = {
@@ -119,7 +121,7 @@ class LoadView:
 
 def load_views(diagnosis: Diagnosis) -> tuple[LoadView, ...]:
     """Return every table of critical loads under baseline and augmented model, fitted ones first."""
-    fitted = zip(*(f.fit.maximum.point.tables for f in (diagnosis.shown, diagnosis.best)), strict=True)
+    fitted = zip(*(f.fit.maximum.point.tables for f in (diagnosis.reported_baseline, diagnosis.best)), strict=True)
     same = diagnosis.best is diagnosis.baseline
     held = ((h.baseline, h.baseline if same else h.augmented) for h in diagnosis.held_loads)
     views = []
@@ -129,7 +131,7 @@ def load_views(diagnosis: Diagnosis) -> tuple[LoadView, ...]:
     return tuple(views)
 
 
-def together(views: Sequence[RunView | LoadView], place: int) -> float | None:
+def pooled_rms(views: Sequence[RunView | LoadView], place: int) -> float | None:
     """Return the root mean square over the noise of several runs and tables together; None of none."""
     if not views:
         return None
@@ -141,7 +143,7 @@ def together(views: Sequence[RunView | LoadView], place: int) -> float | None:
 def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
     """Return the arrays and tables of which figures and report are made, by name."""
     windows = {r.name: [list(w) for w in r.windows] for r in location.runs}
-    friction = [unexplained_friction(f, with_parameters=False) for f in (diagnosis.baseline, diagnosis.best)]
+    friction = [smoothed_friction_field(f, with_parameters=False) for f in (diagnosis.baseline, diagnosis.best)]
     runs = []
     for v in run_views(diagnosis):
         runs.append({
@@ -174,7 +176,7 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
     }
 
 
-def scan_row(row: Row) -> dict[str, Any]:
+def scan_row(row: ScanStatistic) -> dict[str, Any]:
     """Return a place of the residual scan, v in um/s and phi in s, by whose logarithms samples were sorted."""
     found = asdict(row)
     if row.axis in ("v", "phi"):
@@ -198,7 +200,7 @@ def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 def parameter_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return each parameter under both models, and the shift of the baseline's, in the augmented model's standard errors."""
-    before, after = parameters_of(diagnosis.shown), parameters_of(diagnosis.best)
+    before, after = parameters_of(diagnosis.reported_baseline), parameters_of(diagnosis.best)
     rows = []
     for name in dict.fromkeys([*before, *after]):
         a, b = before.get(name), after.get(name)

@@ -30,22 +30,22 @@ from srfcli.diagnosis.augment import augment
 from srfcli.diagnosis.search import Fitted
 from srfcli.diagnosis.verdict import Diagnosis
 from srfcli.inference.fit import Problem, solve_scaled
-from srfcli.inference.prediction import of_run, predict, run_parameters, stiffness_share
+from srfcli.inference.prediction import effect_inputs, predict, run_parameters, stiffness_share
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 
 # The experiment that would discriminate between hypotheses which explain a recording equally well.
 
-TOLD_APART = 12.0  # of log likelihood: hypotheses so far apart are told apart
-WORTH_MAKING = 3.0  # below which a run is not worth making
+DISCRIMINATING_GAIN = 12.0  # of log likelihood: hypotheses so far apart are told apart
+MIN_DESIGN_GAIN = 3.0  # below which a run is not worth making
 MOST_HYPOTHESES = 3  # hypotheses between which a run is to discriminate
 CANDIDATE_RUNS, VARIATIONS = 60, 16  # runs that are tried, and variations of the best of them
-LOOKED = 36  # of these, how many with derivatives, at most
-CONFIRMED = 3  # of the best, how many with the motion itself
+MAX_GAINS_COMPUTED = 36  # of these, how many with derivatives, at most
+MAX_REFITTED = 3  # of the best, how many with the motion itself
 NEWTON_ROUNDS = 10  # of Gauss and Newton
-GROWS = 0.1  # e-foldings in a run that leave sliding as steady as it was
-REPEATS = 100  # of a run that nobody will go beyond
-PARTS = 60  # of a run, in which it is found how much of it suffices
+MAX_GROWTH = 0.1  # e-foldings in a run that leave sliding as steady as it was
+MAX_REPEATS = 100  # of a run that nobody will go beyond
+DURATION_TRIALS = 60  # parts of a run, to find how much of it suffices
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,11 @@ class DiscriminatingRun:
     @property
     def discriminates(self) -> bool:
         """Return whether the run is worth making."""
-        return self.gain >= WORTH_MAKING
+        return self.gain >= MIN_DESIGN_GAIN
 
 
 @dataclass(frozen=True)
-class Side:
+class RivalModel:
     """A fitted hypothesis that is to predict a run: precision (k, k) of its parameters over `scale` (k,), by what is recorded."""
 
     fitted: Fitted
@@ -91,7 +91,7 @@ class Side:
     precision: Array
 
     @classmethod
-    def of(cls, fitted: Fitted) -> Side:
+    def of(cls, fitted: Fitted) -> RivalModel:
         """Return the side of a hypothesis; what belongs to one recorded run alone is not free in another."""
         likelihood, point = fitted.fit.likelihood, fitted.fit.maximum.point
         kept = [i for i, n in enumerate(likelihood.names) if "." not in n]
@@ -129,7 +129,7 @@ class Side:
         p = run_parameters(model, self.problem.experiment, run, {**self.values(), "field_amplitude": 0.0})
         V, W = run.drive.at(float(run.t[0])), run.first_load
         J = np.asarray(model.rates_jacobian(np.asarray(model.steady(p)), V, W, 0.0, p), dtype=float)
-        return bool(np.linalg.eigvals(J).real.max() * float(np.ptp(run.t)) < GROWS)
+        return bool(np.linalg.eigvals(J).real.max() * float(np.ptp(run.t)) < MAX_GROWTH)
 
     def predicted(self, run: Run) -> Array | None:
         """Return what the hypothesis predicts (n,), on a smooth track; None if it cannot be followed."""
@@ -137,7 +137,7 @@ class Side:
         found = predict(self.problem.model, self.problem.experiment, run, values)
         return found.y if found.status.ok and np.isfinite(found.y).all() else None
 
-    def loss(self, run: Run, y: Array, z: Array | None = None, *, slopes: bool = True) -> Loss | None:
+    def lack_of_fit(self, run: Run, y: Array, z: Array | None = None, *, slopes: bool = True) -> LackOfFit | None:
         """Return what is lost after steps z (k,) where `y` (n,) is shown, by innovations; None if it cannot be followed."""
         f = self.fitted.fit.likelihood.filtered(replace(run, observed=y), self.values(z), slopes=slopes)
         if not f.whole:
@@ -146,17 +146,17 @@ class Side:
         for j, (name, scale) in enumerate(zip(self.names, self.scale, strict=True)):
             if name in f.names:
                 X[:, j] = -f.found.nu_d[:, f.names.index(name)] / size * scale
-        return Loss(f.white, X, self.precision, f.found.nu)
+        return LackOfFit(f.white, X, self.precision, f.found.nu)
 
 
 @dataclass(frozen=True)
-class Loss:
-    """What a wrong model loses: `w` (n,) and `X` (n, k) standardised, `Q`; `left` (n,) is the difference itself."""
+class LackOfFit:
+    """What a wrong model loses: `w` (n,) and `X` (n, k) standardised, `Q`; `difference` (n,) is the difference itself."""
 
     w: Array
     X: Array
     Q: Array
-    left: Array
+    difference: Array
 
     def gain(self, *, samples: int | None = None, times: float = 1.0) -> float:
         """Return the log likelihood lost in the first `samples`, in a run made `times` times."""
@@ -166,7 +166,7 @@ class Loss:
 
 
 @dataclass(frozen=True)
-class Trial:
+class PredictedRun:
     """A run as the hypotheses predict it: `y` (n,) by name; `bound` no gain exceeds, `gain` at first order where known."""
 
     proposal: Proposal
@@ -184,45 +184,45 @@ def discriminating_run(
     Looked for are runs with the apparatus' own velocities, loads and modulations, and up to twice beyond them: so many are
     `tried`, and so many of the best are `varied`.
     """
-    sides = foremost(diagnosis)
-    if diagnosis.verdict != "ambiguous" or len(sides) < 2:
+    rivals = rival_models(diagnosis)
+    if diagnosis.verdict != "ambiguous" or len(rivals) < 2:
         return None
-    return Design(diagnosis.experiment, sides, seed).best(tried, varied)
+    return Design(diagnosis.experiment, rivals, seed).best(tried, varied)
 
 
-def foremost(diagnosis: Diagnosis) -> tuple[Side, ...]:
+def rival_models(diagnosis: Diagnosis) -> tuple[RivalModel, ...]:
     """Return the hypotheses between which a run is to discriminate, three at most."""
-    return tuple(Side.of(f) for f in diagnosis.close[:MOST_HYPOTHESES])
+    return tuple(RivalModel.of(f) for f in diagnosis.close[:MOST_HYPOTHESES])
 
 
 class Design:
     """The search for a run among those that an apparatus can make."""
 
-    def __init__(self, experiment: Experiment, sides: Sequence[Side], seed: int) -> None:
-        self.experiment, self.sides = experiment, tuple(sides)
-        self.pairs = list(permutations(sides, 2))  # of a true and a wrong hypothesis
+    def __init__(self, experiment: Experiment, rivals: Sequence[RivalModel], seed: int) -> None:
+        self.experiment, self.rivals = experiment, tuple(rivals)
+        self.pairs = list(permutations(rivals, 2))  # of a true and a wrong hypothesis
         self.apparatus: Capabilities = capabilities_of(experiment)
         self.rng = np.random.default_rng(seed)
         self.tried = 0
 
     def best(self, tried: int, varied: int) -> DiscriminatingRun | None:
         """Return the best run of so many, and of variations of it; None where no model can be followed through any."""
-        looked = self.look(draw(self.apparatus, tried, self.rng), LOOKED)
+        looked = self.first_order_gains(draw(self.apparatus, tried, self.rng), MAX_GAINS_COMPUTED)
         if not looked:
             return None
         near = vary(looked[0].proposal, self.apparatus, varied, self.rng)
-        looked = sorted([*looked, *self.look(near, varied, above=looked[0].gain)], key=lambda t: -t.gain)
-        judged = [found for trial in looked[:CONFIRMED] if (found := self.judge(trial)) is not None]
+        looked = sorted([*looked, *self.first_order_gains(near, varied, above=looked[0].gain)], key=lambda t: -t.gain)
+        judged = [found for trial in looked[:MAX_REFITTED] if (found := self.judge(trial)) is not None]
         return max(judged, key=lambda found: found.gain, default=None)
 
-    def look(self, proposals: Sequence[Proposal], most: int, *, above: float = -1.0) -> list[Trial]:
+    def first_order_gains(self, proposals: Sequence[Proposal], most: int, *, above: float = -1.0) -> list[PredictedRun]:
         """Return runs with their gains at first order, the best first; those that cannot be best are left out."""
         self.tried += len(proposals)
         trials = [t for t in map(self.predict, proposals) if t is not None]
-        by_kind: dict[str, list[Trial]] = {}
+        by_kind: dict[str, list[PredictedRun]] = {}
         for trial in sorted(trials, key=lambda t: -t.bound):
             by_kind.setdefault(trial.proposal.kind, []).append(trial)
-        found: list[Trial] = []
+        found: list[PredictedRun] = []
         while any(by_kind.values()) and len(found) < most:
             for queue in by_kind.values():  # stick-slip has the largest differences, and absorbs most of them
                 if queue and (trial := queue.pop(0)).bound > above and len(found) < most:
@@ -231,48 +231,48 @@ class Design:
                     found.append(trial)
         return sorted(found, key=lambda t: -t.gain)
 
-    def predict(self, proposal: Proposal) -> Trial | None:
+    def predict(self, proposal: Proposal) -> PredictedRun | None:
         """Return a run as all hypotheses predict it, None where it cannot begin or one cannot be followed."""
-        begun = self.begun(proposal)
+        begun = self.stably_started(proposal)
         if begun is None:
             return None
         proposal, run = begun
         y = {}
-        for side in self.sides:
-            found = side.predicted(run)
+        for rival in self.rivals:
+            found = rival.predicted(run)
             if found is None:
                 return None
-            y[side.name] = found
+            y[rival.name] = found
         apart = []
         for true, wrong in self.pairs:
-            lost = wrong.loss(run, y[true.name], slopes=False)
+            lost = wrong.lack_of_fit(run, y[true.name], slopes=False)
             if lost is None:
                 return None
             apart.append(0.5 * float(lost.w @ lost.w))
-        return Trial(proposal, run, y, min(apart))
+        return PredictedRun(proposal, run, y, min(apart))
 
-    def begun(self, proposal: Proposal) -> tuple[Proposal, Run] | None:
+    def stably_started(self, proposal: Proposal) -> tuple[Proposal, Run] | None:
         """Return a run that begins in stable sliding, whichever hypothesis is true: as it is, or led in."""
-        for tried in (proposal, led_in(proposal, self.apparatus)):
+        for tried in (proposal, with_fast_start(proposal, self.apparatus)):
             if tried is not None:
                 run = run_of(tried, self.experiment)
-                if all(side.steady(run) for side in self.sides):
+                if all(rival.steady(run) for rival in self.rivals):
                     return tried, run
         return None
 
-    def gain(self, trial: Trial) -> float:
+    def gain(self, trial: PredictedRun) -> float:
         """Return the gain at first order: that of the pair least apart, the worse way round."""
         least = np.inf
         for true, wrong in self.pairs:
-            lost = wrong.loss(trial.run, trial.y[true.name])
+            lost = wrong.lack_of_fit(trial.run, trial.y[true.name])
             if lost is None:
                 return 0.0
             least = min(least, lost.gain())
         return least
 
-    def judge(self, trial: Trial) -> DiscriminatingRun | None:
+    def judge(self, trial: PredictedRun) -> DiscriminatingRun | None:
         """Return what a run is worth, every wrong model refitted by the motion itself."""
-        losses: dict[tuple[str, str], Loss] = {}
+        losses: dict[tuple[str, str], LackOfFit] = {}
         for true, wrong in self.pairs:
             lost = self.refitted(trial.run, wrong, trial.y[true.name])
             if lost is None:
@@ -280,27 +280,27 @@ class Design:
             losses[true.name, wrong.name] = lost
         worth = {pair: lost.gain() for pair, lost in losses.items()}
         true_name, wrong_name = min(worth, key=lambda pair: worth[pair])
-        seconds, repeats = _enough(list(losses.values()), trial)
-        names, run = tuple(s.name for s in self.sides), trial.run
-        wrong = self.sides[names.index(wrong_name)]
+        seconds, repeats = _sufficient_duration(list(losses.values()), trial)
+        names, run = tuple(s.name for s in self.rivals), trial.run
+        wrong = self.rivals[names.index(wrong_name)]
         noise = float(wrong.values()[wrong.fitted.fit.likelihood.gauges(run)[0]["gauge_white"]])
         first, second = sorted((true_name, wrong_name), key=names.index)
-        left = losses[true_name, wrong_name].left * (1.0 if true_name == first else -1.0)
-        at = int(np.argmax(np.abs(left)))
+        difference = losses[true_name, wrong_name].difference * (1.0 if true_name == first else -1.0)
+        at = int(np.argmax(np.abs(difference)))
         factor = float(per_elongation(run.observable, run.stiffness, run.load(run.t)[0][at]))
         return DiscriminatingRun(
             names, trial.proposal, run, worth[true_name, wrong_name],
             {a: min(g for (true, _), g in worth.items() if true == a) for a in names}, seconds, repeats, (first, second),
-            float(run.t[at]), float(left[at]), abs(float(left[at])) / factor,
+            float(run.t[at]), float(difference[at]), abs(float(difference[at])) / factor,
             shown_unit(OBSERVABLES[run.observable], stress=self.experiment.stress),
             noise, trial.y, self.tried, shown_unit("N", stress=self.experiment.stress),
         )  # fmt: skip
 
-    def refitted(self, run: Run, wrong: Side, y: Array) -> Loss | None:
+    def refitted(self, run: Run, wrong: RivalModel, y: Array) -> LackOfFit | None:
         """Return what a wrong model loses once it was fitted to what the true one shows, and to all that it is known from."""
         Q = wrong.precision
         z, damping = np.zeros(Q.shape[0]), 0.0
-        lost = wrong.loss(run, y, z)
+        lost = wrong.lack_of_fit(run, y, z)
         if lost is None:
             return None
         for _ in range(NEWTON_ROUNDS):
@@ -309,7 +309,7 @@ class Design:
             step = solve_scaled(A, b)
             if float(b @ step) < 0.02 * (1 + _cost(lost, z)) and not damping:
                 break
-            trial = wrong.loss(run, y, z + step)
+            trial = wrong.lack_of_fit(run, y, z + step)
             if trial is not None and _cost(trial, z + step) < _cost(lost, z):
                 lost, z = trial, z + step
                 damping = 0.0 if damping < 1e-3 else damping / 10
@@ -320,34 +320,34 @@ class Design:
         return replace(lost, w=lost.w + lost.X @ z)
 
 
-def _cost(lost: Loss, z: Array) -> float:
+def _cost(lost: LackOfFit, z: Array) -> float:
     return float(lost.w @ lost.w + z @ lost.Q @ z)
 
 
-def _enough(losses: Sequence[Loss], trial: Trial) -> tuple[float | None, int | None]:
+def _sufficient_duration(losses: Sequence[LackOfFit], trial: PredictedRun) -> tuple[float | None, int | None]:
     """Return how many seconds of a run gain enough, and how many repeats of it; None where none do."""
     n = trial.run.t.size
-    if min(x.gain() for x in losses) >= TOLD_APART:
-        for k in np.unique(np.linspace(0, n, PARTS + 1).astype(int)[1:]).tolist():
-            if min(x.gain(samples=k) for x in losses) >= TOLD_APART:
+    if min(x.gain() for x in losses) >= DISCRIMINATING_GAIN:
+        for k in np.unique(np.linspace(0, n, DURATION_TRIALS + 1).astype(int)[1:]).tolist():
+            if min(x.gain(samples=k) for x in losses) >= DISCRIMINATING_GAIN:
                 return float(trial.run.t[k - 1] - trial.run.t[0]), 1
-    low, high = 1, REPEATS
-    if min(x.gain(times=high) for x in losses) < TOLD_APART:
+    low, high = 1, MAX_REPEATS
+    if min(x.gain(times=high) for x in losses) < DISCRIMINATING_GAIN:
         return None, None
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if min(x.gain(times=middle) for x in losses) >= TOLD_APART else (middle, high)
+        low, high = (low, middle) if min(x.gain(times=middle) for x in losses) >= DISCRIMINATING_GAIN else (middle, high)
     return high * trial.proposal.duration, high
 
 
 # Runs that an apparatus could still make: drives and loads drawn around those that it has shown.
 
-BEYOND_SHOWN = 2.0  # beyond what was shown
+EXTRAPOLATION_FACTOR = 2.0  # beyond what was shown
 SAMPLES_PER_PERIOD = 8.0  # samples of a period: a load is not known from fewer
-LOAD_STEPS_FROM = 0.01  # of the load, from where on a run is one with load steps
+MIN_LOAD_STEP = 0.01  # of the load, from where on a run is one with load steps
 MANY_VELOCITIES = 12  # velocities of a recorded drive that stand for all of them
 MOST_EPS = 0.9
-LEAD = 0.1  # of a run, in which it begins fast; the same of its way
+FAST_START_SHARE = 0.1  # of a run, in which it begins fast; the same of its way
 UNKNOWN_LOAD = 1.0  # N: what stands for a load that no recording tells
 RUN_NAME = "discriminating"
 STEPS, HOLD, LOAD, WAVE = "velocity steps", "slide-hold-slide", "load steps", "modulation"
@@ -443,13 +443,13 @@ class Capabilities:
 
 def capabilities_of(experiment: Experiment) -> Capabilities:
     """Return what the runs of an experiment, held-out ones too, have shown."""
-    waves = {r.name: of_run(r) for r in experiment.runs}
+    waves = {r.name: effect_inputs(r) for r in experiment.runs}
     modulated = [r for r in experiment.runs if waves[r.name]["modulated"]]
     plain = [r for r in experiment.runs if not waves[r.name]["modulated"]]
     jumps, rises = [], []
     for run in plain:
         W, rate = run.load(run.t)
-        if np.ptp(W) > LOAD_STEPS_FROM * W.mean():
+        if np.ptp(W) > MIN_LOAD_STEP * W.mean():
             jumps.append(float(np.ptp(W) / W[0]))
             rises.append(float(np.ptp(W) / (2 * max(np.abs(rate).max(), 1e-12))))
     shown = [waves[r.name] for r in modulated]
@@ -493,11 +493,11 @@ def draw(apparatus: Capabilities, number: int, rng: np.random.Generator) -> list
     return [_drawn(apparatus, kinds[i % len(kinds)], rng) for i in range(number)]
 
 
-def led_in(proposal: Proposal, apparatus: Capabilities) -> Proposal | None:
+def with_fast_start(proposal: Proposal, apparatus: Capabilities) -> Proposal | None:
     """Return the run with a fast beginning, as sliding that is not stable has to begin; None where there is no room for it."""
     (length, V), *rest = proposal.drive
     fastest = max(apparatus.V)
-    lead = _digits(LEAD * min(proposal.duration, apparatus.travel / fastest))
+    lead = _digits(FAST_START_SHARE * min(proposal.duration, apparatus.travel / fastest))
     if fastest <= V or length <= 2 * lead:
         return None
     return replace(proposal, drive=((lead, fastest), (_digits(length - lead), V), *rest))
@@ -530,7 +530,7 @@ def vary(proposal: Proposal, apparatus: Capabilities, number: int, rng: np.rando
 
 def _drawn(apparatus: Capabilities, kind: str, rng: np.random.Generator) -> Proposal:
     def near(values: Sequence[float]) -> float:
-        factor = float(np.exp(rng.uniform(-1, 1) * math.log(BEYOND_SHOWN)))
+        factor = float(np.exp(rng.uniform(-1, 1) * math.log(EXTRAPOLATION_FACTOR)))
         return _within(values[int(rng.integers(len(values)))] * factor, values)
 
     like = apparatus.modulated if kind == WAVE else apparatus.plain
@@ -559,7 +559,7 @@ def _drawn(apparatus: Capabilities, kind: str, rng: np.random.Generator) -> Prop
 
 def _timed(V: Sequence[float], shares: Sequence[float], span: float, travel: float) -> tuple[tuple[float, float], ...]:
     """Return (duration, velocity) of pieces that last `span` s together, less where the track would be too short."""
-    total, travel = sum(shares), (1 - LEAD) * travel
+    total, travel = sum(shares), (1 - FAST_START_SHARE) * travel
     lengths = [span * s / total for s in shares]
     way = sum(d * v for d, v in zip(lengths, V, strict=True))
     if way > travel:  # the fast pieces are made shorter, each to its share of the way
@@ -569,7 +569,7 @@ def _timed(V: Sequence[float], shares: Sequence[float], span: float, travel: flo
 
 def _allowed(W0: float, steps: tuple[tuple[float, float], ...], apparatus: Capabilities) -> tuple[tuple[float, float], ...]:
     """Return steps that keep the load within what was shown, times two."""
-    low, high = min(apparatus.W0) / BEYOND_SHOWN, BEYOND_SHOWN * max(apparatus.W0)
+    low, high = min(apparatus.W0) / EXTRAPOLATION_FACTOR, EXTRAPOLATION_FACTOR * max(apparatus.W0)
     size = max((abs(j) for _, j in steps), default=0.0)
     if not size:
         return steps
@@ -584,7 +584,7 @@ def _frequency(value: float, apparatus: Capabilities, interval: float) -> float:
 
 def _within(value: float, shown: Sequence[float]) -> float:
     """Return a value, with two digits, no further than a factor of two outside what was shown."""
-    return _digits(float(np.clip(_digits(float(value), 2), min(shown) / BEYOND_SHOWN, max(shown) * BEYOND_SHOWN)))
+    return _digits(float(np.clip(_digits(float(value), 2), min(shown) / EXTRAPOLATION_FACTOR, max(shown) * EXTRAPOLATION_FACTOR)))
 
 
 def _digits(value: float, digits: int = 3) -> float:
@@ -612,7 +612,7 @@ def run_of(proposal: Proposal, experiment: Experiment) -> Run:
 # What is told of the discriminating run: sentences, plain data, and an experiment for what each hypothesis predicts.
 
 FOLDER = "discriminating"
-RUNS, COLUMNS = "\n[[runs]]\n", "\n[columns]\n"
+RUNS_HEADING, COLUMNS_HEADING = "\n[[runs]]\n", "\n[columns]\n"
 
 
 def sentences(found: DiscriminatingRun) -> list[str]:
@@ -621,26 +621,29 @@ def sentences(found: DiscriminatingRun) -> list[str]:
     if not found.discriminates:
         return [
             f"Nothing within this apparatus' reach discriminates between {names}: of {found.tried} runs tried, the best "
-            f"gains {found.gain:.2g} in log likelihood, and {TOLD_APART:g} are wanted. For this apparatus they are one class."
+            f"gains {found.gain:.2g} in log likelihood, and {DISCRIMINATING_GAIN:g} are wanted. "
+            "For this apparatus they are one class."
         ]
     return [
         f"What would discriminate between {names} is {run.kind}: {run.text(found.load_unit)}; "
         f"sampled at {1 / run.interval:.4g} Hz.",
         f"Whichever of them is true, the others then lose at least {found.gain:.3g} in log likelihood, refitted to all runs. "
-        + _long(found),
-        _look(found),
+        + _duration_sentence(found),
+        _largest_difference(found),
     ]
 
 
-def _long(found: DiscriminatingRun) -> str:
+def _duration_sentence(found: DiscriminatingRun) -> str:
     if found.seconds is None or found.repeats is None:
-        return f"No number of repeats of this run gains {TOLD_APART:g}: its parameters would have to be known better first."
+        return (
+            f"No number of repeats of this run gains {DISCRIMINATING_GAIN:g}: its parameters would have to be known better first."
+        )
     if found.repeats > 1:
-        return f"{TOLD_APART:g} are gained in {found.repeats} such runs, {found.seconds:.3g} s in all."
-    return f"{TOLD_APART:g} are gained in the first {found.seconds:.3g} s of it."
+        return f"{DISCRIMINATING_GAIN:g} are gained in {found.repeats} such runs, {found.seconds:.3g} s in all."
+    return f"{DISCRIMINATING_GAIN:g} are gained in the first {found.seconds:.3g} s of it."
 
 
-def _look(found: DiscriminatingRun) -> str:
+def _largest_difference(found: DiscriminatingRun) -> str:
     """Return where to look, and for how much."""
     first, second = map(_name, found.pair)
     before = [(t, what) for t, what in found.proposal.changes(found.load_unit) if t <= found.at]
@@ -682,7 +685,7 @@ def run_text(found: DiscriminatingRun, experiment: Experiment) -> str:
     run = replace(found.run, holdout=False)
     description = experiment_files(replace(experiment, runs=(run,)))[DESCRIPTION]
     load = found.proposal.text(found.load_unit).partition("; load ")[2]
-    return f"[[runs]]\n# load {load}, as the file has it\n{description.rpartition(RUNS)[2]}"
+    return f"[[runs]]\n# load {load}, as the file has it\n{description.rpartition(RUNS_HEADING)[2]}"
 
 
 def discriminating_files(
@@ -697,7 +700,7 @@ def discriminating_files(
         if fitted.name not in found.predicted or f"{place}/{DESCRIPTION}" in files:
             continue
         made = augment(registry, diagnosis.experiment, fitted.hypothesis, fitted.fit, folder=folder / place, reader=reader)
-        head = made.files[DESCRIPTION].partition(RUNS)[0].partition(COLUMNS)[0]
+        head = made.files[DESCRIPTION].partition(RUNS_HEADING)[0].partition(COLUMNS_HEADING)[0]
         files |= {f"{place}/{name}": content for name, content in made.files.items()}
         files[f"{place}/{DESCRIPTION}"] = f"{head.rstrip()}\n\n{text}"
         files[f"{place}/{run.file.name}"] = run_csv(replace(run, observed=found.predicted[fitted.name]))

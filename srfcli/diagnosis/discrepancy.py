@@ -27,9 +27,9 @@ from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base
 from srfcli.diagnosis.hypotheses import own_parameters
 from srfcli.diagnosis.residual_scan import BINS
-from srfcli.diagnosis.search import BUDGET, CLOSE, Fitted, ModelSearch
-from srfcli.diagnosis.verdict import Diagnosis, Held, at_bounds, held_out, refusal
-from srfcli.inference.fit import root
+from srfcli.diagnosis.search import BUDGET, LOG_BAYES_MARGIN, Fitted, ModelSearch
+from srfcli.diagnosis.verdict import Diagnosis, HeldOutRun, at_bounds, held_out, holdout_rejection
+from srfcli.inference.fit import principal_deviations
 from srfcli.inference.recordings import slip_along
 from srfcli.laws.effect_file import SCANNED_VALUES, formula_text
 from srfcli.laws.expression import symbol
@@ -40,13 +40,13 @@ from srfcli.symbolic.system import apart
 
 # The friction that is missing, along the recordings.
 
-NORMAL = 1.959963984540054  # standard deviations of a 95 % band
+Z_95 = 1.959963984540054  # standard deviations of a 95 % band
 DIFFERENCE_STEP = 0.2  # standard errors of the differences that tell what the parameters' errors do to it
 COORDINATES = ("v", "phi", "W", "dlnWdt", "slip", "t")
 
 
 @dataclass(frozen=True)
-class RunForce:
+class SmoothedField:
     """The friction `force` (n,) that no law explains along one run, at its samples `t` (s), and its 95 % band `low`, `high`.
 
     Beside it what the model passes through: v (um/s), phi (s), W (N), dlnWdt (1/s), slip (um, from the run's start).
@@ -74,7 +74,7 @@ class RunForce:
         return "\n".join([",".join(heads), *rows]) + "\n"
 
 
-def unexplained_friction(fitted: Fitted, *, with_parameters: bool = True) -> dict[str, RunForce]:
+def smoothed_friction_field(fitted: Fitted, *, with_parameters: bool = True) -> dict[str, SmoothedField]:
     """Return the friction of each fitted run that the model leaves to its random field; nothing of a model without one.
 
     The band is that of the field given the recordings, and of the parameters, to first order, unless that is left out.
@@ -88,26 +88,26 @@ def unexplained_friction(fitted: Fitted, *, with_parameters: bool = True) -> dic
     def field_of(x: Array) -> list[Array]:
         return [f.smoothed().mean[:, at] for f in likelihood.at(x, slopes=False, keep=True).runs]
 
-    smoothed = [f.smoothed() for f in fitted.remainder.runs]
+    smoothed = [f.smoothed() for f in fitted.projection.runs]
     variance = [np.maximum(s.covariance[:, at, at], 0.0) for s in smoothed]
     free = np.nonzero(np.diag(maximum.covariance) > 0)[0] if with_parameters else np.zeros(0, dtype=int)
-    for direction in root(maximum.covariance[np.ix_(free, free)]).T:
+    for direction in principal_deviations(maximum.covariance[np.ix_(free, free)]).T:
         x = maximum.point.x.copy()
         x[free] += DIFFERENCE_STEP * direction
         for own, s, moved in zip(variance, smoothed, field_of(x), strict=True):
             own += np.nan_to_num((moved - s.mean[:, at]) / DIFFERENCE_STEP) ** 2
     found = {}
-    for f, s, own in zip(fitted.remainder.runs, smoothed, variance, strict=True):
-        x, spread = s.mean, NORMAL * np.sqrt(own)
+    for f, s, own in zip(fitted.projection.runs, smoothed, variance, strict=True):
+        x, spread = s.mean, Z_95 * np.sqrt(own)
         W, W_dot = f.run.load(f.run.t)
-        found[f.run.name] = RunForce(
+        found[f.run.name] = SmoothedField(
             f.run.t, x[:, at], x[:, at] - spread, x[:, at] + spread, np.exp(x[:, states.index("ln_v")]),
             np.exp(x[:, age]), W, W_dot / W, slip_along(f.run, x, tuple(states)),
         )  # fmt: skip
     return found
 
 
-def coordinates_of(runs: Mapping[str, RunForce]) -> dict[str, float]:
+def correlation_ratios(runs: Mapping[str, SmoothedField]) -> dict[str, float]:
     """Return the share of the force's variance within runs that averages over bins of each quantity of state account for."""
     values = np.concatenate([r.force - r.force.mean() for r in runs.values()])
     weights = np.concatenate([1 / np.maximum((r.high - r.low) ** 2, 1e-18) for r in runs.values()])
@@ -136,11 +136,11 @@ ORIGIN = "terms"
 def with_terms(registry: Registry) -> Registry:
     """Return the registry with the candidate terms besides; one whose name is taken is left out."""
     taken = {e.name for e in registry.entries("effect")}
-    return registry.plus(e for e in _entries() if e.name not in taken)
+    return registry.plus(e for e in _term_entries() if e.name not in taken)
 
 
 @lru_cache(maxsize=1)
-def _entries() -> tuple[Entry, ...]:
+def _term_entries() -> tuple[Entry, ...]:
     found = []
     for path in sorted(TERMS_FOLDER.glob("*.toml")):
         kind, name, about = read_header(path)
@@ -148,7 +148,7 @@ def _entries() -> tuple[Entry, ...]:
     return tuple(found)
 
 
-def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
+def best_closed_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
     """Return the closed form that explains most for its length; None where no term helps, or held-out runs refuse all."""
     registry = with_terms(search.registry)
     names = {e.name for e in registry.entries("effect") if e.origin == ORIGIN}
@@ -158,13 +158,13 @@ def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
     if diagnosis.best is not diagnosis.baseline and not diagnosis.best.passes:
         start.append(diagnosis.best)
     own.extend(start)
-    least = max(f.evidence for f in start) + CLOSE
+    least = max(f.evidence for f in start) + LOG_BAYES_MARGIN
     for best in own.ranked():
         terms = [e for e in best.hypothesis.effects if e.name in names]
         if not terms or best.evidence < least:
             continue
         held = held_out(diagnosis.baseline, best, diagnosis.experiment)
-        if at_bounds(best) or refusal([h.predicted for h in held]):
+        if at_bounds(best) or holdout_rejection([h.predicted for h in held]):
             search.progress(f"{best.name} is not offered: held-out runs refuse it, or it stands at a bound")
             continue
         beside = tuple(e for e in best.hypothesis.effects if e.name not in names)
@@ -185,19 +185,19 @@ def _fitted(effect: Effect, fitted: Fitted) -> FittedTerm:
 def explain_unknown(diagnosis: Diagnosis, form: ClosedForm | None, *, searched: bool = True) -> dict[str, Any]:
     """Return what there is to say where no registered effect explains a recording, as plain data and arrays.
 
-    `force` holds, by run, the arrays of `RunForce.described`, and `form`, `unit`; `latent` is how that force was estimated.
+    `force` holds, by run, the arrays of `SmoothedField.described`, and `form`, `unit`; `latent` is how that force was estimated.
     `form`, `gain`, `held_gain`, `terms` and the rest of `ClosedForm.described` are of the closed form, `form` None where no term
     helps, or where the search for it did not end, `searched`; `toml` is that form as an effect file.
     """
     baseline = diagnosis.baseline
-    force = unexplained_friction(baseline)
+    force = smoothed_friction_field(baseline)
     found: dict[str, Any] = {"form": None, "searched": searched, "gain": None, "held_gain": None, "terms": [], "toml": None}
     if form is not None:
         found |= {**form.described(), "toml": form.as_toml()}
     values = baseline.fit.values
     found["latent"] = {
         "amplitude": values["field_amplitude"], "length": values["field_length"],
-        "rms_over_noise": baseline.fit.maximum.point.rms, "coordinates": coordinates_of(force) if force else {},
+        "rms_over_noise": baseline.fit.maximum.point.rms, "coordinates": correlation_ratios(force) if force else {},
     }  # fmt: skip
     found["csv"] = {name: run.csv() for name, run in force.items()}
     found["force"] = {**{n: run.described() for n, run in force.items()}, "form": found["form"], "unit": "1"}
@@ -234,7 +234,7 @@ class ClosedForm:
     beside: tuple[Effect, ...]
     fitted: Fitted = field(repr=False)
     gain: float
-    held: tuple[Held, ...] = field(repr=False)
+    held: tuple[HeldOutRun, ...] = field(repr=False)
 
     @property
     def text(self) -> str:
@@ -244,7 +244,7 @@ class ClosedForm:
         numbers = []
         for term in self.terms:
             units = {p.name: p.unit for p in term.effect.parameters}
-            numbers += [f"{n} = {with_error(v, e)}{_unit(units[n])}" for n, (v, e) in term.values.items()]
+            numbers += [f"{n} = {format_with_error(v, e)}{_unit(units[n])}" for n, (v, e) in term.values.items()]
             numbers += [f"{c.name} = {c.default:g}{_unit(c.unit)}" for c in term.effect.constants]
         beside = f" (beside {', '.join(e.name for e in self.beside)})" if self.beside else ""
         return "; ".join(formulas) + " with " + ", ".join(dict.fromkeys(numbers)) + beside
@@ -252,12 +252,12 @@ class ClosedForm:
     def formulas(self) -> dict[str, sp.Expr]:
         """Return the terms together, by slot: in each the slot's own name is what was there before all of them."""
         found: dict[str, sp.Expr] = {}
-        for effect in self.named():
+        for effect in self.with_distinct_parameters():
             for slot, formula in effect.written or effect.changes:
                 found[slot] = formula.xreplace({symbol(slot): found.get(slot, symbol(slot))})
         return found
 
-    def named(self) -> tuple[Effect, ...]:
+    def with_distinct_parameters(self) -> tuple[Effect, ...]:
         """Return the terms with parameters that no two of them share; their constants as numbers where names would clash."""
         effects = [t.effect for t in self.terms]
         constants: dict[str, Parameter] = {}
@@ -287,7 +287,7 @@ class ClosedForm:
 
     def as_toml(self, *, name: str = FORM_NAME) -> str:
         """Return the terms as one effect file, fitted values as defaults."""
-        named = self.named()
+        named = self.with_distinct_parameters()
         head: dict[str, object] = {"format": "srf-law/1", "kind": "effect", "name": name}
         head |= {"about": "Found by search, not by theory: " + "; ".join(e.about for e in named)}
         head |= {slot: formula_text(f) for slot, f in self.formulas().items()}
@@ -318,7 +318,7 @@ def _parameters(effect: Effect, values: Sequence[float]) -> dict[str, object]:
     }  # fmt: skip
 
 
-def with_error(value: float, error: float) -> str:
+def format_with_error(value: float, error: float) -> str:
     """Return a value with its standard error, to two digits of that."""
     if not (isfinite(error) and error > 0):
         return f"{value:.6g}"

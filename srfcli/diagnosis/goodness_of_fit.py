@@ -13,34 +13,36 @@ from itertools import product
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.inference.critical_loads import IMPROBABLE, chance_of
+from srfcli.inference.critical_loads import MIN_P_VALUE, chi2_p_value
 from srfcli.inference.fit import fit_problem
 from srfcli.inference.noise import difference_level, stretches
 from srfcli.inference.state_space import (
-    DEVIATION,
     LAGS,
+    MAX_DEVIATION,
     NOT_CONVERGED,
     Filtered,
     Likelihood,
     Point,
     StateSpaceFit,
     correlated,
-    cut,
+    segments,
     typical_friction,
 )
 
-PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
-STEADY = 2.0  # gauge's noise: a stretch whose readings are expected to vary by less is one of steady sliding
-CORRELATED = "innovations are correlated"
-LEVELS = ("gauge_white", "gauge_colour")
-LOUD = 1.15  # gauge noise over that of differences, and held-out innovations, beyond which they hold something else
+# amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
+MAX_FIELD_AMPLITUDE = 3e-3
+STEADY_VARIATION = 2.0  # gauge's noise: a stretch whose readings are expected to vary by less is one of steady sliding
+CORRELATED_INNOVATIONS = "innovations are correlated"
+GAUGE_LEVELS = ("gauge_white", "gauge_colour")
+MAX_NOISE_RATIO = 1.15  # gauge noise over that of differences, and held-out innovations, beyond which they hold something else
 LEVEL_GAIN, LEVELS_TOLD = 5.0, 6  # in log likelihood for each level, from where it is told, and how many are
-REPEATED = 0.72  # share of readings that repeat the one before where a step is four times white noise; at six values are off
+# share of readings that repeat the one before where a step is four times white noise; at six values are off
+MAX_REPEATED_SHARE = 0.72
 # relative variance, times n, of a level that n uncorrelated numbers tell, and third differences: (1 + 2 sum rho^2) / 2
-UNCORRELATED, THIRD = 0.5, 1.16
+LEVEL_VARIANCE, THIRD_DIFFERENCE_VARIANCE = 0.5, 1.16
 
 
-def shortcomings(found: StateSpaceFit) -> list[str]:
+def failed_tests(found: StateSpaceFit) -> list[str]:
     """Return what speaks against a fit: sentences, the worst first; none where it passes every test."""
     point, values = found.maximum.point, found.values
     if not np.isfinite(point.log_likelihood) or found.maximum.away > NOT_CONVERGED:
@@ -54,11 +56,11 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
             information = float(f.information[k, k])
             if information > 0:
                 off = abs(float(f.score[k])) / np.sqrt(information)
-                tests.append((off / DEVIATION, f"the field is of another amplitude in {f.run.name}"))
-    tests += _of_loads(found)
-    tests.append((correlated(point) / DEVIATION, CORRELATED))
-    tests.append((field_share(found), f"the field's amplitude is {values.get('field_amplitude', 0.0):.2g}"))
-    tests += loudness(found.likelihood, point)
+                tests.append((off / MAX_DEVIATION, f"the field is of another amplitude in {f.run.name}"))
+    tests += _critical_load_tests(found)
+    tests.append((correlated(point) / MAX_DEVIATION, CORRELATED_INNOVATIONS))
+    tests.append((relative_field_amplitude(found), f"the field's amplitude is {values.get('field_amplitude', 0.0):.2g}"))
+    tests += gauge_noise_tests(found.likelihood, point)
     return [text for size, text in sorted(tests, reverse=True) if size > 1.0]
 
 
@@ -69,7 +71,7 @@ def uneven_noise(found: StateSpaceFit) -> list[str]:
         off = (float(f.white @ f.white) - f.white.size) / np.sqrt(2 * f.white.size)
         groups.setdefault(found.likelihood.problem.noise_group(f.run), []).append((off, f.run.name))
     for (least, quiet), (most, loud) in ((min(runs), max(runs)) for runs in groups.values()):
-        if least < -DEVIATION and most > DEVIATION:
+        if least < -MAX_DEVIATION and most > MAX_DEVIATION:
             return [f"{loud} is louder and {quiet} quieter than the noise that both share: --vary noise gives each its own"]
     return []
 
@@ -113,30 +115,32 @@ def coarse_readings(found: StateSpaceFit) -> list[str]:
     runs = found.likelihood.problem.runs
     rounded = [(run.name, s) for run in runs for s in run.signals if s.quantum]
     repeats = [(name, np.mean(np.abs(np.diff(s.observed[s.used])) < 0.5 * s.quantum)) for name, s in rounded]
-    coarse = list(dict.fromkeys(name for name, share in repeats if share > REPEATED))
+    coarse = list(dict.fromkeys(name for name, share in repeats if share > MAX_REPEATED_SHARE))
     if not coarse:
         return []
     steps = "are rounded to steps of more than four times the noise: values may be off by several of their errors"
     return [f"readings of {', '.join(coarse)} {steps}"]
 
 
-def field_share(found: StateSpaceFit) -> float:
+def relative_field_amplitude(found: StateSpaceFit) -> float:
     """Return the amplitude of a fit's random friction field over the largest that a track may have; 0 without a field."""
     if found.smooth:
         return 0.0
     friction = max(float(np.median([typical_friction(f.run) for f in found.maximum.point.runs])), 1e-6)
-    return found.values["field_amplitude"] / friction / PLAUSIBLE
+    return found.values["field_amplitude"] / friction / MAX_FIELD_AMPLITUDE
 
 
-def taken_up(found: StateSpaceFit) -> bool:
+def noise_is_implausible(found: StateSpaceFit) -> bool:
     """Return whether field or gauge noise has taken up more than either can be, or the field is as long as it may be: a trend."""
-    if field_share(found) > 1 or any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point)):
+    if relative_field_amplitude(found) > 1 or any(
+        size > 1 for size, _ in gauge_noise_tests(found.likelihood, found.maximum.point)
+    ):
         return True
     at = -1 if found.smooth else found.likelihood.names.index("field_length")
     return not found.smooth and bool(found.maximum.point.x[at] >= found.likelihood.upper[at])
 
 
-def loudness(likelihood: Likelihood, point: Point) -> list[tuple[float, str]]:
+def gauge_noise_tests(likelihood: Likelihood, point: Point) -> list[tuple[float, str]]:
     """Return how loud each kind of gauge noise is, over what third differences of the recordings allow, in words."""
     levels: dict[str, list[tuple[float, float, int]]] = {}
     tests = []
@@ -150,13 +154,18 @@ def loudness(likelihood: Likelihood, point: Point) -> list[tuple[float, str]]:
         quantum = max(q for _, q, _ in shown) / np.sqrt(12)
         for seen, _, n in shown:
             ratio = float(np.hypot(point.values[name], quantum)) / seen
-            tests.append((over_noise(ratio, n, THIRD), f"the gauge's noise is {ratio:.2f} times what the recording shows"))
+            tests.append(
+                (
+                    noise_ratio_over_limit(ratio, n, THIRD_DIFFERENCE_VARIANCE),
+                    f"the gauge's noise is {ratio:.2f} times what the recording shows",
+                )
+            )
     return tests
 
 
-def over_noise(ratio: float, n: int, variance: float = UNCORRELATED) -> float:
-    """Return a level over that of noise, over what it may be: LOUD, or DEVIATION by its relative `variance` over n, if more."""
-    return ratio / max(LOUD, 1 + DEVIATION * float(np.sqrt(variance / max(n, 1))))
+def noise_ratio_over_limit(ratio: float, n: int, variance: float = LEVEL_VARIANCE) -> float:
+    """Return a level over that of noise, over its limit, MAX_NOISE_RATIO or 1 + MAX_DEVIATION standard errors, if more."""
+    return ratio / max(MAX_NOISE_RATIO, 1 + MAX_DEVIATION * float(np.sqrt(variance / max(n, 1))))
 
 
 def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[float, str]]:
@@ -165,22 +174,22 @@ def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[
     name = f"{signal.observable} of {f.run.name}" if number else f.run.name
     n = white.size
     off = abs(float(np.sum(white**2)) - n) / np.sqrt(2 * n)
-    tests = [(off / DEVIATION, f"innovations of {name} have an rms of {np.sqrt(np.mean(white**2)):.3f}")]
+    tests = [(off / MAX_DEVIATION, f"innovations of {name} have an rms of {np.sqrt(np.mean(white**2)):.3f}")]
     owns = found.likelihood.gauges(f.run, number)
-    gauges = [[found.values[n] for local, n in own.items() if local.startswith(LEVELS)] for own in owns]
+    gauges = [[found.values[n] for local, n in own.items() if local.startswith(GAUGE_LEVELS)] for own in owns]
     level = np.linalg.norm(np.array(gauges), axis=1)[f.run.sampling.at][signal.used]
     expected = (signal.observed - f.of(number).nu)[signal.used]
-    for piece, y, noise in zip(cut(white), cut(expected), cut(level), strict=True):
+    for piece, y, noise in zip(segments(white), segments(expected), segments(level), strict=True):
         m = piece.size
         loud = (float(np.sum(np.clip(piece, -6, 6) ** 2)) - m) / np.sqrt(2 * m)
         shifted = abs(float(np.sum(piece))) / np.sqrt(m)
-        if np.std(y) < STEADY * np.mean(noise):
-            loud *= _smooth_share(piece)
-        tests.append((max(loud, shifted) / (DEVIATION + 1.0), f"a stretch of {name} is off"))
+        if np.std(y) < STEADY_VARIATION * np.mean(noise):
+            loud *= _autocorrelated_share(piece)
+        tests.append((max(loud, shifted) / (MAX_DEVIATION + 1.0), f"a stretch of {name} is off"))
     return tests
 
 
-def _of_loads(found: StateSpaceFit) -> list[tuple[float, str]]:
+def _critical_load_tests(found: StateSpaceFit) -> list[tuple[float, str]]:
     """Return tests of the critical loads: chi2 of all, less what was fitted to them, and each table's largest residual."""
     tables = found.maximum.point.tables
     if not tables:
@@ -191,21 +200,23 @@ def _of_loads(found: StateSpaceFit) -> list[tuple[float, str]]:
         fitted += float(np.trace(t.information * np.outer(unit, unit) @ found.maximum.covariance))
     cost = sum(t.match.cost for t in tables)
     freedom = max(size - fitted, 1.0)
-    tests = [(improbability(cost, freedom), f"critical loads have chi2 {cost:.1f} on {freedom:.0f} degrees of freedom")]
+    tests = [(relative_surprisal(cost, freedom), f"critical loads have chi2 {cost:.1f} on {freedom:.0f} degrees of freedom")]
     for t in tables:
         worst = int(np.argmax(np.abs(t.white)))
         line, residual = t.loads.table.lines[worst], float(abs(t.white[worst]))
-        tests.append((residual / DEVIATION, f"the critical load of line {line} of {t.loads.name} is {residual:.1f} sigma off"))
+        tests.append(
+            (residual / MAX_DEVIATION, f"the critical load of line {line} of {t.loads.name} is {residual:.1f} sigma off")
+        )
     return tests
 
 
-def improbability(cost: float, freedom: float) -> float:
-    """Return the logarithm of the chance of a chi2 of critical loads over that of IMPROBABLE: above 1 it is none."""
-    chance = chance_of(cost, freedom)
-    return float(np.log(max(chance, 1e-300)) / np.log(IMPROBABLE))
+def relative_surprisal(cost: float, freedom: float) -> float:
+    """Return the logarithm of the chance of a chi2 of critical loads over that of MIN_P_VALUE: above 1 it is none."""
+    chance = chi2_p_value(cost, freedom)
+    return float(np.log(max(chance, 1e-300)) / np.log(MIN_P_VALUE))
 
 
-def _smooth_share(white: Array) -> float:
+def _autocorrelated_share(white: Array) -> float:
     """Return how much of the variance beyond 1 in a stretch of innovations (m,) goes on from sample to sample, from 0 to 1.
 
     In steady sliding all of it does where the model is off; a burst of noise leaves innovations that are loud and white.

@@ -15,13 +15,13 @@ from srfcli.core.units import to_base
 from srfcli.data.scales import at_scale, scales_of
 from srfcli.data.values import BOUND_FACTOR, Experiment, FitParameter
 from srfcli.inference.fit import Problem, fit_problem
-from srfcli.inference.prediction import of_run
+from srfcli.inference.prediction import effect_inputs
 from srfcli.laws.expression import symbol
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.symbolic.system import without_part
 
-ABSENT = 1e-3  # of the least size of an effect: what it does in a run where it does not act is far below any noise
+NEUTRAL_OFFSET = 1e-3  # of the least size of an effect: what it does in a run where it does not act is far below any noise
 UNMODULATED = {symbol(name): 0 for name in ("modulated", "eps", "envelope")}
 
 
@@ -65,7 +65,7 @@ def applicable(
         if set(effect.frees) & free:
             continue
         effect = at_scale(effect, scales)
-        reason = _unseen(effect, experiment)
+        reason = _not_observable(effect, experiment)
         if any(n not in base.names for n in effect.needs):
             waiting += [effect] if not reason else []
         elif reason:
@@ -76,29 +76,29 @@ def applicable(
     return [*found, *(e for e in waiting if brought.issuperset(e.needs))], excluded
 
 
-def _unseen(effect: Effect, experiment: Experiment) -> str:
+def _not_observable(effect: Effect, experiment: Experiment) -> str:
     """Return why recordings and critical loads cannot show an effect at all, or nothing."""
     reasons = []
     if experiment.runs:
         loads = [run.load(run.t)[0] for run in experiment.runs]
         spread = max(float(np.ptp(np.log(W))) for W in loads)
         between = float(np.ptp([np.log(W.mean()) for W in loads])) if len(loads) > 1 else 0.0
-        modulated = any(of_run(run)["modulated"] for run in experiment.runs)
+        modulated = any(effect_inputs(run)["modulated"] for run in experiment.runs)
         if "V" in dict(effect.changes) and any(s.observable == "slip" for run in experiment.runs for s in run.others):
             reasons.append("the slip that is observed is compared with the drive as it is stated")
         else:
-            reasons.append(_unseen_under(effect, spread, between, "" if modulated else "no run has a modulated load"))
+            reasons.append(_not_observable_under(effect, spread, between, "" if modulated else "no run has a modulated load"))
     if experiment.thresholds:
         if reason := without_part(effect):
             reasons.append(f"critical loads do not depend on it: it {reason}")
         else:
             W, eps = (np.concatenate([getattr(t.table, name) for t in experiment.thresholds]) for name in ("W0c", "eps"))
             calm = "" if eps.max() > 0 else "the load is constant"
-            reasons.append(_unseen_under(effect, float(eps.max()), float(np.ptp(np.log(W))), calm))
+            reasons.append(_not_observable_under(effect, float(eps.max()), float(np.ptp(np.log(W))), calm))
     return reasons[0] if all(reasons) else ""
 
 
-def _unseen_under(effect: Effect, spread: float, between: float, unmodulated: str) -> str:
+def _not_observable_under(effect: Effect, spread: float, between: float, unmodulated: str) -> str:
     """Return why an effect cannot be seen where ln W varies by `spread` while sliding, and by `between` from one time to another.
 
     `unmodulated` is the reason where no load is modulated.
@@ -212,14 +212,14 @@ def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment
     """Return start values and bounds of an effect's parameters in um, s, N: sizes at their neutral values, or just inside.
 
     An effect of one run alone is neutral in the others. Where neutral lies outside the bounds, as a time constant of zero, which
-    formulas divide by, its value there is off neutral by ABSENT of the distance to the bound.
+    formulas divide by, its value there is off neutral by NEUTRAL_OFFSET of the distance to the bound.
     """
     neutral, found = neutral_values(effect), []
     for name, p in own_parameters(effect, model).items():
         low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
         value = float(np.clip(neutral.get(p.name, to_base(p.default, p.unit)), low, high))
         runs = (effect.run,) if effect.run and p.name in neutral else ()
-        absent = neutral[p.name] + ABSENT * (value - neutral[p.name]) if runs else 0.0
+        absent = neutral[p.name] + NEUTRAL_OFFSET * (value - neutral[p.name]) if runs else 0.0
         found.append(FitParameter(name, value, low, high, p.name in effect.fixed, p.unit, runs, absent))
     for name in effect.frees:
         if name == "K":
@@ -248,7 +248,7 @@ def inner_grid(effect: Effect) -> list[dict[str, float]]:
 
 
 @dataclass(frozen=True)
-class Shape:
+class ProfileFunction:
     """An effect of first order that is a function g of one table's argument and of inner parameters."""
 
     argument: str
@@ -256,7 +256,7 @@ class Shape:
     inner: tuple[str, ...]
 
 
-def along_table(effect: Effect) -> Shape | None:
+def profile_function(effect: Effect) -> ProfileFunction | None:
     """Return the shape of an effect that adds size * g(slip, time or stage) to mu, or multiplies V by 1 + it; None for others."""
     if len(effect.changes) != 1 or len(effect.sizes) != 1 or effect.states or effect.settings:
         return None
@@ -273,4 +273,4 @@ def along_table(effect: Effect) -> Shape | None:
     if len(arguments) != 1 or not arguments <= tables:
         return None
     (argument,) = arguments
-    return Shape(argument, sp.lambdify([symbol(argument), *map(symbol, inner)], slope, "numpy"), tuple(inner))
+    return ProfileFunction(argument, sp.lambdify([symbol(argument), *map(symbol, inner)], slope, "numpy"), tuple(inner))

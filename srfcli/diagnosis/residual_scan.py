@@ -24,7 +24,7 @@ from srfcli.data.values import Run
 from srfcli.diagnosis.search import Fitted
 from srfcli.inference.kalman import Innovations
 from srfcli.inference.noise import stretches
-from srfcli.inference.prediction import of_run
+from srfcli.inference.prediction import effect_inputs
 from srfcli.inference.recordings import slip_along
 from srfcli.motion.simulate import stick_slip
 
@@ -32,16 +32,17 @@ from srfcli.motion.simulate import stick_slip
 
 SIGNIFICANT = 0.01  # p-value, adjusted for all that was looked at, from which a place stands out
 DRAWS = 200
-CLIPPED = 10.0  # standard deviations of the noise beyond which a residual counts no more, where times are told
-RUN_CELLS, HELD = 64, 0.8  # of a run, and the share of its excess that its windows must hold
-OWN = ("run", "window")  # axes along a run's time
-NAMED_AT_MOST = 5  # windows and lines that are named
-PROMINENT, BESIDE, FAINT = (4.0, 15, 0.01)  # of a line: times its neighbours' median, how many neighbours, share of the strongest
-EVENTS = 3  # stick-slip events from which there is a cycle
+MAX_RESIDUAL = 10.0  # standard deviations of the noise beyond which a residual counts no more, where times are told
+RUN_CELLS, EXCESS_SHARE = 64, 0.8  # of a run, and the share of its excess that its windows must hold
+TIME_AXES = ("run", "window")  # axes along a run's time
+MAX_NAMED = 5  # windows and lines that are named
+# of a line: times its neighbours' median, how many neighbours, share of the strongest
+MIN_PROMINENCE, NEIGHBOURS, MIN_RELATIVE_HEIGHT = (4.0, 15, 0.01)
+MIN_EVENTS = 3  # stick-slip events from which there is a cycle
 
 
 @dataclass(frozen=True)
-class RunPlace:
+class RunMisfit:
     """A run that stands out: its share of the excess misfit, and the times, on its own clock, that hold most of it."""
 
     name: str
@@ -54,12 +55,12 @@ class RunPlace:
 class Location:
     """Where the misfit is: `forcing_phase` in rad (of a cosine of the load), `coordinate` the name and the share it explains."""
 
-    runs: tuple[RunPlace, ...]
+    runs: tuple[RunMisfit, ...]
     forcing_phase: tuple[float, float] | None
     frequencies: tuple[float, ...]
     coordinate: tuple[str, float] | None
     p_value: float
-    rows: tuple[Row, ...] = field(default=(), repr=False)
+    rows: tuple[ScanStatistic, ...] = field(default=(), repr=False)
 
     def described(self) -> dict[str, object]:
         """Return the object that `srf.diagnose/1` has under location."""
@@ -85,35 +86,38 @@ def locate(fitted: Fitted, *, last: Fitted | None = None, seed: int = 0) -> Loca
     likelihood, values = fitted.fit.likelihood, fitted.fit.values
     if not likelihood.problem.runs:
         return Location((), None, (), None, 1.0)
-    forcing = {r.name: of_run(r)["f"] for r in likelihood.problem.runs if of_run(r)["modulated"]}
+    forcing = {r.name: effect_inputs(r)["f"] for r in likelihood.problem.runs if effect_inputs(r)["modulated"]}
     if last is not None:
         values = {n: last.fit.values.get(n, v) for n, v in values.items()}  # on a smooth track its field is of amplitude 0
-    pieces = pieces_of(fitted, values)
+    pieces = run_residuals(fitted, values)
 
-    def of(some: Sequence[Piece]) -> Location:
+    def of(some: Sequence[RunResiduals]) -> Location:
         scan = ResidualScan(some, len(likelihood.names), kept=last is not None)
-        return stands_out(scan, scan.projected([p.white for p in some]), scan.null(DRAWS, seed=seed), forcing)
+        return significant_misfit(scan, scan.projected([p.white for p in some]), scan.null(DRAWS, seed=seed), forcing)
 
     whole = of(pieces)
     if last is None:
         return whole
     begun = of([p.followed() for p in pieces])
-    rows = [r for r in whole.rows if r.axis in OWN] + [r for r in begun.rows if r.axis not in OWN]
+    rows = [r for r in whole.rows if r.axis in TIME_AXES] + [r for r in begun.rows if r.axis not in TIME_AXES]
     return replace(begun, runs=whole.runs, p_value=min(whole.p_value, begun.p_value), rows=tuple(rows))
 
 
-def stands_out(scan: ResidualScan, M: Sequence[Array], null: Array, forcing: Mapping[str, float]) -> Location:
+def significant_misfit(scan: ResidualScan, M: Sequence[Array], null: Array, forcing: Mapping[str, float]) -> Location:
     """Return what stands out of projected residuals M (n,) by run; `forcing` is the modulation's frequency (Hz) by run."""
     rows = scan.rows(M, null)
-    excess = {p.name: float(m @ m - spare.sum()) for p, m, spare in zip(scan.pieces, M, scan.spare, strict=True)}
+    excess = {
+        p.name: float(m @ m - expected_squares.sum())
+        for p, m, expected_squares in zip(scan.pieces, M, scan.expected_squares, strict=True)
+    }
     whole = sum(max(e, 0.0) for e in excess.values())
     runs = []
-    for piece, m, spare in zip(scan.pieces, M, scan.spare, strict=True):
-        own = [r for r in rows if r.run == piece.name and r.axis in (*OWN, "frequency")]
+    for piece, m, expected_squares in zip(scan.pieces, M, scan.expected_squares, strict=True):
+        own = [r for r in rows if r.run == piece.name and r.axis in (*TIME_AXES, "frequency")]
         best = min(own, key=lambda r: r.log_p)
         if best.p_value < SIGNIFICANT:
             share = max(excess[piece.name], 0.0) / whole if whole > 0 else 0.0
-            runs.append(RunPlace(piece.name, share, _windows(piece, m, spare, own), best.p_value))
+            runs.append(RunMisfit(piece.name, share, _windows(piece, m, expected_squares, own), best.p_value))
     return Location(
         tuple(sorted(runs, key=lambda r: (-r.share, r.p_value))),
         _phase([r for r in rows if r.axis == "forcing" and r.kind == "mean"]),
@@ -124,37 +128,39 @@ def stands_out(scan: ResidualScan, M: Sequence[Array], null: Array, forcing: Map
     )
 
 
-def _windows(piece: Piece, m: Array, spare: Array, rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
+def _windows(
+    piece: RunResiduals, m: Array, expected_squares: Array, rows: Sequence[ScanStatistic]
+) -> tuple[tuple[float, float], ...]:
     """Return the shortest stretches that hold most of a run's excess; the slow shapes that stand out where power does not."""
     powerful = [r for r in rows if r.kind == "power" and r.p_value < SIGNIFICANT]
     if powerful:
-        return _dense(piece, m, spare)
+        return _dense(piece, m, expected_squares)
     found: list[tuple[float, float]] = []
-    slow = [r for r in rows if r.axis in OWN and r.kind == "shape" and r.p_value < SIGNIFICANT]
+    slow = [r for r in rows if r.axis in TIME_AXES and r.kind == "shape" and r.p_value < SIGNIFICANT]
     for row in sorted(slow, key=lambda r: r.log_p):
         if all(row.high < a or row.low > b for a, b in found):
             found.append((row.low, row.high))
-    return tuple(sorted(found[:NAMED_AT_MOST]))
+    return tuple(sorted(found[:MAX_NAMED]))
 
 
-def _dense(piece: Piece, m: Array, spare: Array) -> tuple[tuple[float, float], ...]:
+def _dense(piece: RunResiduals, m: Array, expected_squares: Array) -> tuple[tuple[float, float], ...]:
     edges = np.linspace(0, m.size, min(RUN_CELLS, max(m.size // 16, 1)) + 1).astype(int)
-    power = np.minimum(m**2, CLIPPED**2)  # a lost cycle is a misfit as any other
-    excess = np.array([float(np.sum(power[a:b] - spare[a:b])) for a, b in pairwise(edges.tolist())])
+    power = np.minimum(m**2, MAX_RESIDUAL**2)  # a lost cycle is a misfit as any other
+    excess = np.array([float(np.sum(power[a:b] - expected_squares[a:b])) for a, b in pairwise(edges.tolist())])
     order = np.argsort(-excess)
     reached = np.cumsum(excess[order])
-    count = int(np.searchsorted(reached, HELD * reached.max())) + 1
+    count = int(np.searchsorted(reached, EXCESS_SHARE * reached.max())) + 1
     taken = np.zeros(excess.size, dtype=bool)
     taken[order[:count]] = True
     closed = taken.copy()
     closed[1:-1] |= taken[:-2] & taken[2:]  # a single cell between two that count is no gap
     steps = np.diff(np.concatenate([[0], closed.astype(int), [0]]))
     spans = list(zip(np.nonzero(steps > 0)[0].tolist(), np.nonzero(steps < 0)[0].tolist(), strict=True))
-    best = sorted(spans, key=lambda s: -float(excess[s[0] : s[1]].sum()))[:NAMED_AT_MOST]
+    best = sorted(spans, key=lambda s: -float(excess[s[0] : s[1]].sum()))[:MAX_NAMED]
     return tuple(sorted((float(piece.t[edges[a]]), float(piece.t[edges[b] - 1])) for a, b in best))
 
 
-def _phase(rows: Sequence[Row]) -> tuple[float, float] | None:
+def _phase(rows: Sequence[ScanStatistic]) -> tuple[float, float] | None:
     """Return the stretch of the forcing's period, in rad, whose bins stand out with one sign, about the strongest."""
     if not rows or min(r.p_value for r in rows) >= SIGNIFICANT:
         return None
@@ -178,7 +184,7 @@ def _phase(rows: Sequence[Row]) -> tuple[float, float] | None:
     return (low, high if high > low else high + turn)
 
 
-def _lines(rows: Sequence[Row], scan: ResidualScan, forcing: Mapping[str, float]) -> tuple[float, ...]:
+def _lines(rows: Sequence[ScanStatistic], scan: ResidualScan, forcing: Mapping[str, float]) -> tuple[float, ...]:
     """Return the frequencies of narrow peaks: the forcing's harmonics, where no other is nearer, then others, strongest first."""
     peaks: list[tuple[bool, float, float, float]] = []  # harmonic or not, statistic, frequency, width
     for piece in scan.pieces:
@@ -186,7 +192,7 @@ def _lines(rows: Sequence[Row], scan: ResidualScan, forcing: Mapping[str, float]
         S = np.array([r.statistic for r in own])
         base = forcing.get(piece.name)
         for i, row in enumerate(own):
-            if i < 3 or row.p_value >= SIGNIFICANT or not _peaked(S, i):
+            if i < 3 or row.p_value >= SIGNIFICANT or not _is_peak(S, i):
                 continue
             f, width = 0.5 * (row.low + row.high), row.high - row.low
             order = round(f / base) if base else 0
@@ -195,22 +201,22 @@ def _lines(rows: Sequence[Row], scan: ResidualScan, forcing: Mapping[str, float]
     strongest = max((strength for _, strength, _, _ in peaks), default=0.0)
     found: list[tuple[float, float]] = []
     for harmonic, strength, f, width in sorted(peaks, reverse=True):
-        seen = harmonic or strength >= FAINT * strongest
+        seen = harmonic or strength >= MIN_RELATIVE_HEIGHT * strongest
         if seen and all(abs(f - g) > 1.5 * max(width, w) for g, w in found):
             found.append((f, width))
-    return tuple(f for f, _ in found[:NAMED_AT_MOST])
+    return tuple(f for f, _ in found[:MAX_NAMED])
 
 
-def _peaked(S: Array, i: int) -> bool:
+def _is_peak(S: Array, i: int) -> bool:
     """Return whether a line stands above all beside it, and clearly above what is a little further away."""
-    beside = np.concatenate([S[max(i - BESIDE, 0) : max(i - 2, 0)], S[i + 3 : i + BESIDE + 1]])
-    return bool(S[i] >= S[max(i - 3, 0) : i + 4].max() and S[i] >= PROMINENT * np.median(beside))
+    beside = np.concatenate([S[max(i - NEIGHBOURS, 0) : max(i - 2, 0)], S[i + 3 : i + NEIGHBOURS + 1]])
+    return bool(S[i] >= S[max(i - 3, 0) : i + 4].max() and S[i] >= MIN_PROMINENCE * np.median(beside))
 
 
-def _coordinate(rows: Sequence[Row], scan: ResidualScan, M: Sequence[Array]) -> tuple[str, float] | None:
+def _coordinate(rows: Sequence[ScanStatistic], scan: ResidualScan, M: Sequence[Array]) -> tuple[str, float] | None:
     """Return the quantity a smooth function of which explains most of the excess misfit, with that share."""
     smooth = [r for r in rows if r.run == "" and r.kind == "shape" and r.p_value < SIGNIFICANT]
-    left = sum(float(m @ m) for m in M) - sum(float(s.sum()) for s in scan.spare)
+    left = sum(float(m @ m) for m in M) - sum(float(s.sum()) for s in scan.expected_squares)
     if not smooth or left <= 0:
         return None
     best = max(smooth, key=lambda r: r.statistic - r.freedom)
@@ -222,7 +228,7 @@ def _coordinate(rows: Sequence[Row], scan: ResidualScan, M: Sequence[Array]) -> 
 LOST_CYCLE = 30.0  # standard deviations of an innovation: a cycle is lost
 
 
-def pieces_of(fitted: Fitted, values: Mapping[str, float]) -> list[Piece]:
+def run_residuals(fitted: Fitted, values: Mapping[str, float]) -> list[RunResiduals]:
     """Return each fitted run's standardised innovations under `values`, derivatives, and what its samples can be sorted by."""
     likelihood = fitted.fit.likelihood
     found = []
@@ -232,7 +238,7 @@ def pieces_of(fitted: Fitted, values: Mapping[str, float]) -> list[Piece]:
         scale = np.array([abs(values.get(n, 0.0)) for n in f.names])
         white = got.nu[index] / np.sqrt(got.S[index])
         X = -got.nu_d[index] / np.sqrt(got.S[index])[:, None] * scale
-        places = np.array([likelihood.names.index(n) for n in f.names], dtype=int)
+        indices = np.array([likelihood.names.index(n) for n in f.names], dtype=int)
         good = np.zeros(run.t.size, dtype=bool)
         good[index] = True
         ends = np.cumsum([0, *(b - a for a, b in stretches(run.t, good))]).tolist()
@@ -240,7 +246,7 @@ def pieces_of(fitted: Fitted, values: Mapping[str, float]) -> list[Piece]:
         forcing, cycle = (None if x is None else x[index] for x in (_forcing(run), _cycle(run)))
         lost = LOST_CYCLE if cycle is not None else np.inf  # steady sliding has no cycle to lose
         known = {k: x for k, x in sorted_by.items() if np.isfinite(x).all()}
-        found.append(Piece(run.name, run.t[index], white, X, places, tuple(pairwise(ends)), known, forcing, cycle, lost))
+        found.append(RunResiduals(run.name, run.t[index], white, X, indices, tuple(pairwise(ends)), known, forcing, cycle, lost))
     return found
 
 
@@ -258,7 +264,7 @@ def _coordinates(fitted: Fitted, run: Run, found: Innovations) -> dict[str, Arra
 
 def _forcing(run: Run) -> Array | None:
     """Return the phase of the load's modulation, from 0 to 1, while it is on."""
-    m = of_run(run)
+    m = effect_inputs(run)
     if not m["modulated"]:
         return None
     phase = np.mod(m["f"] * run.t + m["psi"] / (2 * np.pi), 1.0)
@@ -267,9 +273,9 @@ def _forcing(run: Run) -> Array | None:
 
 def _cycle(run: Run) -> Array | None:
     """Return the phase of stick-slip, 0 at one event and 1 at the next, between recorded events."""
-    m = of_run(run)
+    m = effect_inputs(run)
     events = stick_slip(run.t, run.observed, ripple=m["f"] if m["modulated"] else None).times
-    if events.size < EVENTS:
+    if events.size < MIN_EVENTS:
         return None
     phase = np.interp(run.t, events, np.arange(events.size, dtype=float), left=np.nan, right=np.nan)
     return np.asarray(np.mod(phase, 1.0))
@@ -277,18 +283,18 @@ def _cycle(run: Run) -> Array | None:
 
 # Local statistics of a residual, all under one null: windows, bins, lines and smooth functions that may stand out.
 
-WAVES, SHORTEST, HALVINGS = 4, 24, 5  # cosines over a window, samples of the shortest, how often a run is halved
+COSINES, MIN_WINDOW, HALVINGS = 4, 24, 5  # cosines over a window, samples of the shortest, how often a run is halved
 BINS = 12  # of a phase or a quantity, in which residuals or a missing force are averaged
-NUMBERS_AT_ONCE = 4_000_000  # numbers of simulated residuals held at a time
-OFF = 1.08  # factor by which a run's own noise level may differ from the assumed variance and count as noise
-NO_LEVERAGE = 1e-6  # standard deviations by which a parameter moves all innovations together: it has nothing to do with them
+BATCH_SIZE = 4_000_000  # numbers of simulated residuals held at a time
+NOISE_LEVEL_FACTOR = 1.08  # factor by which a run's own noise level may differ from the assumed variance and count as noise
+MIN_LEVERAGE = 1e-6  # standard deviations by which a parameter moves all innovations together: it has nothing to do with them
 ROUNDING_SHARE = 1e-4  # share of a column's squares below which what is left of it is rounding
 SPECTRUM_SAMPLES = 64  # samples from which a spectrum is looked at
 
 
 @dataclass(frozen=True)
-class Piece:
-    """One run: whitened residual (n,) and columns X (n, k) at `places` among all, what its samples can be sorted by.
+class RunResiduals:
+    """One run: whitened residual (n,) and columns X (n, k) at `indices` among all, what its samples can be sorted by.
 
     `parts` are its evenly sampled stretches [a, b); `coordinates`, `forcing` and `cycle` (phases from 0 to 1, NaN where there is
     none) have n values each. `lost` is the residual beyond which the run is no longer followed.
@@ -298,17 +304,17 @@ class Piece:
     t: Array
     white: Array
     X: Array = field(repr=False)
-    places: Array
+    indices: Array
     parts: tuple[tuple[int, int], ...]
     coordinates: Mapping[str, Array] = field(default_factory=dict, repr=False)
     forcing: Array | None = field(default=None, repr=False)
     cycle: Array | None = field(default=None, repr=False)
     lost: float = np.inf
 
-    def followed(self) -> Piece:
+    def followed(self) -> RunResiduals:
         """Return the run up to where the residual first exceeds `lost`; at least a few samples."""
         far = np.abs(self.white) > self.lost
-        n = max(int(np.argmax(far)) if far.any() else far.size, min(SHORTEST, far.size))
+        n = max(int(np.argmax(far)) if far.any() else far.size, min(MIN_WINDOW, far.size))
         parts = tuple((a, min(b, n)) for a, b in self.parts if a < n)
         sorted_by = {k: x[:n] for k, x in self.coordinates.items()}
         forcing, cycle = (None if x is None else x[:n] for x in (self.forcing, self.cycle))
@@ -319,7 +325,7 @@ class Piece:
 
 
 @dataclass(frozen=True)
-class Row:
+class ScanStatistic:
     """One place of the scan: `statistic` with its degrees of `freedom`, the signed `z` of a single column, and p-values.
 
     `axis` is what samples were sorted by, `run` a name or nothing for all together, [low, high] the place; `kind` is mean, power,
@@ -339,7 +345,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class _Item:
+class _StatisticGroup:
     """Statistics of one kind over the same samples: columns of B in `groups`, one statistic each, or sums of squares over H."""
 
     axis: str
@@ -367,7 +373,7 @@ def log_tail(x: Array, freedom: Array | float) -> Array:
 class ResidualScan:
     """All places of some runs, and the projection that goes with them."""
 
-    def __init__(self, pieces: Sequence[Piece], k: int, *, kept: bool = False) -> None:
+    def __init__(self, pieces: Sequence[RunResiduals], k: int, *, kept: bool = False) -> None:
         """Take runs whose columns are at places below k.
 
         Where residuals are `kept` as they are, as their parameters come from elsewhere, nothing is projected; what is then
@@ -377,9 +383,9 @@ class ResidualScan:
         self.root: Array | None = None
         A = np.zeros((k, k))
         for p in self.pieces:
-            A[np.ix_(p.places, p.places)] += p.X.T @ p.X
+            A[np.ix_(p.indices, p.indices)] += p.X.T @ p.X
         d = np.sqrt(np.diag(A))
-        moving = np.nonzero(d > NO_LEVERAGE)[0]
+        moving = np.nonzero(d > MIN_LEVERAGE)[0]
         d = d[moving]
         values, vectors = np.linalg.eigh(A[np.ix_(moving, moving)] / np.outer(d, d))
         good = values > 1e-13 * max(float(values.max(initial=0.0)), 1e-300)
@@ -388,13 +394,13 @@ class ResidualScan:
         self.inverse = root @ root.T
         if kept:
             self.root, self.inverse = root, -self.inverse
-        self.spare = [1 - np.einsum("ij,jk,ik->i", p.X, self._block(p, p), p.X, optimize=True) for p in self.pieces]
+        self.expected_squares = [1 - np.einsum("ij,jk,ik->i", p.X, self._block(p, p), p.X, optimize=True) for p in self.pieces]
         self.spectra = [self._spectrum(i) for i in range(len(self.pieces))]
         self.items = [*self._windows(), *self._bins()]
         self.count = sum(i.freedom.size for i in self.items) + sum(s[1].size for s in self.spectra)
 
-    def _block(self, a: Piece, b: Piece) -> Array:
-        return np.asarray(self.inverse[np.ix_(a.places, b.places)])
+    def _block(self, a: RunResiduals, b: RunResiduals) -> Array:
+        return np.asarray(self.inverse[np.ix_(a.indices, b.indices)])
 
     def projected(self, residuals: Sequence[Array]) -> list[Array]:
         """Return M r by run, r (n,) or (n, d)."""
@@ -402,28 +408,28 @@ class ResidualScan:
             return [self._levelled(r) for r in residuals]
         b = np.zeros((self.k, *residuals[0].shape[1:]))
         for p, r in zip(self.pieces, residuals, strict=True):
-            b[p.places] += p.X.T @ r
+            b[p.indices] += p.X.T @ r
         step = self.inverse @ b
-        return [self._levelled(r - p.X @ step[p.places]) for p, r in zip(self.pieces, residuals, strict=True)]
+        return [self._levelled(r - p.X @ step[p.indices]) for p, r in zip(self.pieces, residuals, strict=True)]
 
     @staticmethod
     def _levelled(r: Array) -> Array:
         """Return a residual over its own noise level, as far as that may differ from what was assumed."""
         level = np.median(r**2, axis=0) / 0.4549
-        return np.asarray(r / np.sqrt(np.clip(level, 1 / OFF, OFF)))
+        return np.asarray(r / np.sqrt(np.clip(level, 1 / NOISE_LEVEL_FACTOR, NOISE_LEVEL_FACTOR)))
 
     def null(self, draws: int, *, seed: int) -> Array:
         """Return the smallest ln p of each of `draws` simulated recordings (draws,), sorted."""
         rng = np.random.default_rng(seed)
         found: list[float] = []
         size = sum(p.white.size for p in self.pieces)
-        at_once = int(np.clip(NUMBERS_AT_ONCE // max(size, 1), 1, draws))
+        at_once = int(np.clip(BATCH_SIZE // max(size, 1), 1, draws))
         while len(found) < draws:
             d = min(at_once, draws - len(found))
             noise = [rng.standard_normal((p.white.size, d)) for p in self.pieces]
             if self.root is not None:
                 track = self.root @ rng.standard_normal((self.root.shape[1], d))
-                noise = [e + p.X @ track[p.places] for p, e in zip(self.pieces, noise, strict=True)]
+                noise = [e + p.X @ track[p.indices] for p, e in zip(self.pieces, noise, strict=True)]
             M = self.projected(noise)
             smallest = np.zeros(d)
             for _, _, _, log_p in self._evaluated(M):
@@ -431,7 +437,7 @@ class ResidualScan:
             found += smallest.tolist()
         return np.sort(np.array(found))
 
-    def rows(self, M: Sequence[Array], null: Array) -> list[Row]:
+    def rows(self, M: Sequence[Array], null: Array) -> list[ScanStatistic]:
         """Return every place of projected residuals M (n,) by run, with p-values adjusted by `null` for all of them."""
         found = []
         for item, statistic, z, log_p in self._evaluated([m[:, None] for m in M]):
@@ -439,8 +445,8 @@ class ResidualScan:
             for k, (low, high) in enumerate(item.spans):
                 own_z = None if z is None else float(z[k, 0])
                 found.append(
-                    Row(item.axis, item.run, item.kind, low, high, float(statistic[k, 0]), float(item.freedom[k]), own_z,
-                        float(log_p[k, 0]), float(adjusted[k]))
+                    ScanStatistic(item.axis, item.run, item.kind, low, high, float(statistic[k, 0]), float(item.freedom[k]),
+                                  own_z, float(log_p[k, 0]), float(adjusted[k]))
                 )  # fmt: skip
         return found
 
@@ -451,7 +457,7 @@ class ResidualScan:
         bound = np.exp(np.maximum(log_p, -690.0)) * self.count
         return np.where(below > 0, simulated, np.minimum(simulated, bound))
 
-    def _evaluated(self, M: Sequence[Array]) -> Iterator[tuple[_Item, Array, Array | None, Array]]:
+    def _evaluated(self, M: Sequence[Array]) -> Iterator[tuple[_StatisticGroup, Array, Array | None, Array]]:
         """Yield (item, statistic (m, d), signed z or None, ln p (m, d)) of projected residuals (n, d) by run."""
         for item in self.items:
             if item.kind == "power":
@@ -474,13 +480,13 @@ class ResidualScan:
                 S = (ss[:, None] * c**2 - 2 * cs[:, None] * c * s + cc[:, None] * s**2) / (cc * ss - cs**2)[:, None]
                 yield item, S, None, -0.5 * S
 
-    def _spectrum(self, i: int) -> tuple[_Item, Array, slice, tuple[Array, Array, Array]]:
+    def _spectrum(self, i: int) -> tuple[_StatisticGroup, Array, slice, tuple[Array, Array, Array]]:
         """Return the lines of a run's longest even stretch: frequencies (m,) and the elements of B'M B for cosine and sine."""
         p = self.pieces[i]
         a, b = max(p.parts, key=lambda q: q[1] - q[0], default=(0, 0))
         n, none = b - a, np.zeros(0)
         if n < SPECTRUM_SAMPLES:
-            return _Item("frequency", p.name, "line", (), ()), none, slice(0, 0), (none, none, none)
+            return _StatisticGroup("frequency", p.name, "line", (), ()), none, slice(0, 0), (none, none, none)
         step = float(np.median(np.diff(p.t[a:b])))
         m = (n - 1) // 2
         f = np.arange(1, m + 1) / (n * step)
@@ -488,29 +494,31 @@ class ResidualScan:
         c, s, block = F.real, -F.imag, self._block(p, p)
         cc, cs, ss = (np.einsum("ij,ij->i", x @ block, y) for x, y in ((c, c), (c, s), (s, s)))
         half = 0.5 / (n * step)
-        item = _Item("frequency", p.name, "line", tuple((x - half, x + half) for x in f.tolist()), (), freedom=np.full(m, 2.0))
+        item = _StatisticGroup(
+            "frequency", p.name, "line", tuple((x - half, x + half) for x in f.tolist()), (), freedom=np.full(m, 2.0)
+        )
         floor = 1e-3 * n  # a line that parameters absorb altogether has no statistic
         return item, f, slice(a, b), (np.maximum(n / 2 - cc, floor), -cs, np.maximum(n / 2 - ss, floor))
 
-    def _windows(self) -> list[_Item]:
+    def _windows(self) -> list[_StatisticGroup]:
         """Return windows of each run: the whole, halves and so on, half overlapping; slow shapes in them, and power."""
         found = []
         for i, p in enumerate(self.pieces):
             n = p.white.size
             for halving in range(HALVINGS + 1):
                 length = n >> halving
-                if length < (SHORTEST if halving else 1):
+                if length < (MIN_WINDOW if halving else 1):
                     break
                 starts = np.unique(np.linspace(0, n - length, 2 ** (halving + 1) - 1).astype(int))
                 for a in starts.tolist():
                     where, span = slice(a, a + length), ((float(p.t[a]), float(p.t[a + length - 1])),)
-                    waves = np.cos(np.pi * np.outer((np.arange(length) + 0.5) / length, np.arange(min(WAVES, length))))
+                    waves = np.cos(np.pi * np.outer((np.arange(length) + 0.5) / length, np.arange(min(COSINES, length))))
                     axis = "window" if halving else "run"
                     found.append(self._linear(axis, p.name, "shape", span, [(i, where, waves)]))
                     found.append(self._power(axis, p.name, span, [(i, where, np.ones((length, 1)))]))
         return found
 
-    def _bins(self) -> list[_Item]:
+    def _bins(self) -> list[_StatisticGroup]:
         found = []
         for axis in ("forcing", "cycle"):
             have = [(i, x) for i, p in enumerate(self.pieces) if (x := getattr(p, axis)) is not None]
@@ -533,7 +541,7 @@ class ResidualScan:
                 found.append(self._linear(name, "", "shape", span, parts))
         return found
 
-    def _binned(self, axis: str, run: str, chosen: Sequence[tuple[int, Array]], edges: Array) -> list[_Item]:
+    def _binned(self, axis: str, run: str, chosen: Sequence[tuple[int, Array]], edges: Array) -> list[_StatisticGroup]:
         """Return mean and power in the bins between `edges`, over all chosen runs together."""
         m = edges.size - 1
         parts = []
@@ -552,26 +560,26 @@ class ResidualScan:
         return [self._linear(axis, run, "mean", spans, means), self._power(axis, run, spans, parts)]
 
     def _linear(self, axis: str, run: str, kind: str, spans: tuple[tuple[float, float], ...],
-                parts: Sequence[tuple[int, slice, Array]]) -> _Item:  # fmt: skip
+                parts: Sequence[tuple[int, slice, Array]]) -> _StatisticGroup:  # fmt: skip
         """Return the statistic of each column of a `mean`, or that of all together, with the roots of (B'M B)^-1."""
         q, k = parts[0][2].shape[1], self.k
         groups = tuple((a, a + 1) for a in range(q)) if kind == "mean" else ((0, q),)
         C, G = np.zeros((q, k)), np.zeros((q, q))
         for i, s, B in parts:
             p = self.pieces[i]
-            C[:, p.places] += B.T @ p.X[s]
+            C[:, p.indices] += B.T @ p.X[s]
             G += B.T @ B
         scale = np.sqrt(np.maximum(np.diag(G), 1e-300))  # before parameters and track absorb what they can
         G = (G - C @ self.inverse @ C.T) / np.outer(scale, scale)
         roots = [_inverse_root(G[a:b, a:b], scale[a:b]) for a, b in groups]
         ranks = np.array([rank for _, rank in roots], dtype=float)
-        return _Item(axis, run, kind, spans, tuple(parts), groups, tuple(root for root, _ in roots), ranks)
+        return _StatisticGroup(axis, run, kind, spans, tuple(parts), groups, tuple(root for root, _ in roots), ranks)
 
     def _power(
         self, axis: str, run: str, spans: tuple[tuple[float, float], ...], parts: Sequence[tuple[int, slice, Array]]
-    ) -> _Item:
-        freedom = sum(B.T @ self.spare[i][s] for i, s, B in parts)
-        return _Item(axis, run, "power", spans, tuple(parts), freedom=np.maximum(np.asarray(freedom), 1e-6))
+    ) -> _StatisticGroup:
+        freedom = sum(B.T @ self.expected_squares[i][s] for i, s, B in parts)
+        return _StatisticGroup(axis, run, "power", spans, tuple(parts), freedom=np.maximum(np.asarray(freedom), 1e-6))
 
 
 def _taper(n: int) -> Array:

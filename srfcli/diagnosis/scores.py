@@ -19,20 +19,21 @@ from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.errors import SrfError
 from srfcli.core.units import to_base
 from srfcli.data.values import Experiment, Run, per_elongation
-from srfcli.diagnosis.hypotheses import Excluded, Shape, along_table, inner_grid, neutral_values, own_parameters
+from srfcli.diagnosis.hypotheses import Excluded, ProfileFunction, inner_grid, neutral_values, own_parameters, profile_function
 from srfcli.inference.critical_loads import TableLikelihood, apparatus
-from srfcli.inference.prediction import own_names, own_start, run_parameters
+from srfcli.inference.prediction import run_parameters, run_specific_names, run_specific_start
 from srfcli.inference.recordings import slip_along
 from srfcli.inference.shared_field import FieldPrior
 from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns, filter_run
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 
-RESEMBLING = 0.9  # likeness of two effects' projected columns beyond which one is tried in the place of the other: a fit decides
-NODES, MOST_NODES = 0.4, 400  # of a shared field: correlation lengths between them; how many
-NO_COLUMN = 1e-100  # of a column's squares: a bump beyond the ends of all runs, say
-COLUMNS_TOGETHER = 32  # columns that are projected at a time
-POINTS_BETWEEN = 20  # points between samples at which a function of slip or stage is averaged
+# likeness of two effects' projected columns beyond which one is tried in the place of the other: a fit decides
+RIVAL_CORRELATION = 0.9
+NODE_SPACING, MAX_NODES = 0.4, 400  # of a shared field: correlation lengths between them; how many
+MIN_SQUARED_NORM = 1e-100  # of a column's squares: a bump beyond the ends of all runs, say
+COLUMN_BLOCK = 32  # columns that are projected at a time
+QUADRATURE_POINTS = 20  # points between samples at which a function of slip or stage is averaged
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,8 @@ class Score:
 class _Column:
     """Columns (2 m, q) of an effect by the size called `name`, at given inner values; names are the effect's own.
 
-    Projected, they are free of what was fitted, of whose directions they had `taken` (p, q); `whole` is their square before that,
-    and `along` (r, q) what they have of the field that all runs share.
+    Projected, they are free of what was fitted, along whose directions they had `coefficients` (p, q); `whole` is their square
+    before that, and `along` (r, q) what they have of the field that all runs share.
     """
 
     effect: Effect
@@ -68,7 +69,7 @@ class _Column:
     inner: dict[str, float]
     columns: Array
     whole: float = 0.0
-    taken: Array | None = None
+    coefficients: Array | None = None
     along: Array | None = None
 
     @property
@@ -81,62 +82,62 @@ class _Column:
 class SharedField:
     """A random friction field that all runs share, at first order: `gain` in log marginal likelihood at its best `amplitude`.
 
-    In directions `u` (2 m, q) it absorbs the parts `absorbed` (q,) of what is left, `left` (q,).
+    In directions `u` (2 m, q) it absorbs the parts `absorbed` (q,) of `projected` (q,).
     """
 
     u: Array = field(repr=False)
     absorbed: Array = field(repr=False)
-    left: Array = field(repr=False)
+    projected: Array = field(repr=False)
     gain: float
     amplitude: float = 0.0
 
 
-class Remainder:
-    """What a fit leaves, `left` (n,): standardised innovations and their squares, projected off what was fitted.
+class ResidualProjection:
+    """What a fit leaves, `projected` (n,): standardised innovations and their squares, projected off what was fitted.
 
-    `rest` (n,) is the same before that, `base` (n, p) are orthonormal directions of what was fitted. Residuals of critical loads,
-    over their errors, stand at the end.
+    `residuals` (n,) is the same before that, `basis` (n, p) are orthonormal directions of what was fitted. Residuals of critical
+    loads, over their errors, stand at the end.
     """
 
     def __init__(self, fitted: StateSpaceFit) -> None:
         self.fitted, point = fitted, fitted.maximum.point
         recorded = [np.concatenate([f.white, (f.white**2 - 1) / np.sqrt(2)]) for f in point.runs]
-        self.rest = np.concatenate([*recorded, *(t.white for t in point.tables)])
-        base = np.zeros((self.rest.size, len(fitted.likelihood.names)))
+        self.residuals = np.concatenate([*recorded, *(t.white for t in point.tables)])
+        basis = np.zeros((self.residuals.size, len(fitted.likelihood.names)))
         at = 0
         for f in point.runs:
             block = _whitened(f)
-            base[at : at + len(block), [fitted.likelihood.names.index(n) for n in f.names]] = block
+            basis[at : at + len(block), [fitted.likelihood.names.index(n) for n in f.names]] = block
             at += len(block)
         for t in point.tables:
-            base[at : at + len(t.white)] = -t.slopes
+            basis[at : at + len(t.white)] = -t.slopes
             at += len(t.white)
-        size = np.linalg.norm(base, axis=0)
-        u, s, v = np.linalg.svd(base[:, size > 0] / size[size > 0], full_matrices=False)
+        size = np.linalg.norm(basis, axis=0)
+        u, s, v = np.linalg.svd(basis[:, size > 0] / size[size > 0], full_matrices=False)
         known = s > 1e-7 * s[0]
-        self.base = u[:, known]
-        self._back = np.zeros((size.size, int(known.sum())))
-        self._back[size > 0] = v[known].T / s[known] / size[size > 0][:, None]
-        self._along = np.zeros((int(known.sum()), size.size))  # each parameter's direction in `base`
-        self._along[:, size > 0] = s[known, None] * v[known]
-        self.left = self.free(self.rest)
+        self.basis = u[:, known]
+        self._to_parameters = np.zeros((size.size, int(known.sum())))
+        self._to_parameters[size > 0] = v[known].T / s[known] / size[size > 0][:, None]
+        self._directions = np.zeros((int(known.sum()), size.size))  # each parameter's direction in `basis`
+        self._directions[:, size > 0] = s[known, None] * v[known]
+        self.projected = self.project(self.residuals)
 
     def padded(self, blocks: Sequence[Array]) -> Array:
         """Return columns (n, k) of the runs' blocks, zero for critical loads."""
         columns = np.concatenate(blocks)
-        return np.concatenate([columns, np.zeros((self.rest.size - len(columns), columns.shape[1]))])
+        return np.concatenate([columns, np.zeros((self.residuals.size - len(columns), columns.shape[1]))])
 
-    def free(self, columns: Array) -> Array:
+    def project(self, columns: Array) -> Array:
         """Return columns (2 m, k) projected off what was fitted."""
-        return np.asarray(columns - self.base @ (self.base.T @ columns))
+        return np.asarray(columns - self.basis @ (self.basis.T @ columns))
 
-    def shifts(self, taken: Array) -> Array:
-        """Return by how much the parameters that were fitted change where something is added that has `taken` (p,) of `base`."""
-        return np.asarray(-self._back @ taken)
+    def shifts(self, coefficients: Array) -> Array:
+        """Return by how much fitted parameters change where something with `coefficients` (p,) in `basis` is added."""
+        return np.asarray(-self._to_parameters @ coefficients)
 
-    def without(self, names: Sequence[str]) -> Array:
-        """Return orthonormal directions (p, r), in `base`, of what was fitted besides the parameters `names`."""
-        u, s, _ = np.linalg.svd(self._along[:, ~np.isin(self.fitted.likelihood.names, names)], full_matrices=False)
+    def basis_without(self, names: Sequence[str]) -> Array:
+        """Return orthonormal directions (p, r), in `basis`, of what was fitted besides the parameters `names`."""
+        u, s, _ = np.linalg.svd(self._directions[:, ~np.isin(self.fitted.likelihood.names, names)], full_matrices=False)
         return np.asarray(u[:, s > 1e-7 * max(s[0], 1e-300)])
 
     @cached_property
@@ -148,31 +149,31 @@ class Remainder:
     def shared(self) -> SharedField:
         """Return the field that all runs share, of the correlation length that each run's own has."""
         if self.fitted.smooth or len(self.runs) < 2 or not all(f.whole for f in self.runs):
-            return SharedField(np.zeros((self.left.size, 0)), np.zeros(0), np.zeros(0), 0.0)
+            return SharedField(np.zeros((self.projected.size, 0)), np.zeros(0), np.zeros(0), 0.0)
         values, states = self.fitted.values, self.fitted.likelihood.problem.model.states
         slips = [slip_along(f.run, f.found.kept.mean, states) for f in self.runs if f.found.kept]
         first, last = min(s.min() for s in slips), max(s.max() for s in slips)
-        count = int(np.clip(np.ceil((last - first) / (NODES * values["field_length"])) + 1, 2, MOST_NODES))
+        count = int(np.clip(np.ceil((last - first) / (NODE_SPACING * values["field_length"])) + 1, 2, MAX_NODES))
         nodes = np.linspace(first, last, count)
-        hat = Shape("slip", lambda s, k: np.interp(s, nodes, np.arange(count) == k), ("node",))
-        columns = self.padded([_carried(f, self.fitted, [(hat, [k]) for k in range(count)]) for f in self.runs])
-        columns = self.free(columns @ FieldPrior(1.0, values["field_length"]).root(nodes))
+        hat = ProfileFunction("slip", lambda s, k: np.interp(s, nodes, np.arange(count) == k), ("node",))
+        columns = self.padded([_propagated_columns(f, self.fitted, [(hat, [k]) for k in range(count)]) for f in self.runs])
+        columns = self.project(columns @ FieldPrior(1.0, values["field_length"]).root(nodes))
         power, directions = np.linalg.eigh(columns.T @ columns)
         known = power > 1e-12 * power[-1]
         size = np.sqrt(power[known])
         u = columns @ (directions[:, known] / size)
-        left = u.T @ self.left
-        best = SharedField(u, np.zeros(size.size), left, 0.0)
+        projected = u.T @ self.projected
+        best = SharedField(u, np.zeros(size.size), projected, 0.0)
         for amplitude in values["field_amplitude"] * np.geomspace(0.01, 3.0, 30):
             power = (amplitude * size) ** 2
-            gain = 0.5 * float(np.sum(left**2 * power / (1 + power) - np.log1p(power)))
+            gain = 0.5 * float(np.sum(projected**2 * power / (1 + power) - np.log1p(power)))
             if gain > best.gain:
-                best = SharedField(u, power / (1 + power), left, gain, float(amplitude))
+                best = SharedField(u, power / (1 + power), projected, gain, float(amplitude))
         return best
 
 
 @dataclass(frozen=True)
-class OwnValue:
+class RunSpecificValue:
     """A parameter with a value of its own in one run: what that gains in log likelihood at first order, and the change there."""
 
     gain: float
@@ -181,19 +182,19 @@ class OwnValue:
     change: float
 
 
-def own_values(remainder: Remainder) -> list[OwnValue]:
+def run_specific_values(projection: ResidualProjection) -> list[RunSpecificValue]:
     """Return what each parameter that runs share would gain by a value of its own in one of them, largest gain first."""
-    runs, names, end, found = remainder.fitted.maximum.point.runs, remainder.fitted.likelihood.problem.names, 0, []
+    runs, names, end, found = projection.fitted.maximum.point.runs, projection.fitted.likelihood.problem.names, 0, []
     for f in runs if len(runs) > 1 else ():
         shared = [n for n in f.names if n in names and "[" not in n and not n.startswith(f"{f.run.name}.")]
-        columns = np.zeros((remainder.rest.size, len(shared)))
+        columns = np.zeros((projection.residuals.size, len(shared)))
         columns[end : end + 2 * f.white.size] = _whitened(f)[:, [f.names.index(n) for n in shared]]
         end += 2 * f.white.size
-        free = remainder.free(columns)
-        power, g = np.sum(free**2, axis=0), free.T @ remainder.left
-        known = power > NO_COLUMN
+        free = projection.project(columns)
+        power, g = np.sum(free**2, axis=0), free.T @ projection.projected
+        known = power > MIN_SQUARED_NORM
         found += [
-            OwnValue(0.5 * float(b) ** 2 / float(a), n, f.run.name, float(b / a))
+            RunSpecificValue(0.5 * float(b) ** 2 / float(a), n, f.run.name, float(b / a))
             for n, a, b in zip(np.array(shared)[known].tolist(), power[known], g[known], strict=True)
         ]
     return sorted(found, key=lambda v: -v.gain)
@@ -206,15 +207,15 @@ class Scores:
         self,
         registry: Registry,
         experiment: Experiment,
-        remainder: Remainder,
+        projection: ResidualProjection,
         present: Sequence[Effect],
         candidates: Sequence[Effect],
     ) -> None:
         self.registry, self.experiment, self.present = registry, experiment, tuple(present)
-        self.remainder, self.fitted = remainder, remainder.fitted
+        self.projection, self.fitted = projection, projection.fitted
         self.excluded: list[Excluded] = []
-        self.shared = self.remainder.shared
-        self.columns = self._projected(self._all(candidates))
+        self.shared = self.projection.shared
+        self.columns = self._projected(self._all_columns(candidates))
         self.every = self._best_of(self.columns)
 
     @cached_property
@@ -225,28 +226,28 @@ class Scores:
             best.setdefault(score.effect.reported, score)
         return list(best.values())
 
-    def _all(self, candidates: Sequence[Effect]) -> list[_Column]:
-        shapes = {e.name: shape for e in candidates if (shape := along_table(e)) is not None}
+    def _all_columns(self, candidates: Sequence[Effect]) -> list[_Column]:
+        shapes = {e.name: shape for e in candidates if (shape := profile_function(e)) is not None}
         found: list[_Column] = []
         regular = [e for e in candidates if e.sizes and not e.settings and not e.observed and e.name not in shapes]
         # a pass costs as its states cubed, and rates that are scanned together may have no steady state
         alone = [e for e in regular if e.states or (e.scans and "rate" in dict(e.changes))]
-        found += self._derived([e for e in regular if e not in alone])
+        found += self._derivative_columns([e for e in regular if e not in alone])
         for effect in alone:
-            found += self._derived([effect])
+            found += self._derivative_columns([effect])
         along = [e for e in candidates if e.name in shapes]
         if along:
-            found += self._along(along, shapes)
+            found += self._table_columns(along, shapes)
         if freed := [e for e in candidates if "K" in e.frees]:
             values = {"K": self.experiment.stiffness, **self.fitted.values}
             columns = self._columns(self.fitted.likelihood.problem.model, (), values, ["K"])
             found += [_Column(e, "K", {}, columns) for e in freed]
         if late := [e for e in candidates if e.observed]:  # of first order in the delay a gauge shows less by what u gained in it
-            columns = self.remainder.padded([_carried(f, self.fitted, (), late=True) for f in self.remainder.runs])
+            columns = self.projection.padded([_propagated_columns(f, self.fitted, (), late=True) for f in self.projection.runs])
             found += [_Column(e, e.sizes[0], {}, columns) for e in late]
         return found
 
-    def _opened(self, added: Sequence[Effect], *, stability: bool) -> GeneratedModel:
+    def _open_model(self, added: Sequence[Effect], *, stability: bool) -> GeneratedModel:
         choice = self.experiment.choice.plus(e.name for e in (*self.present, *added))
         return open_model(self.registry, **asdict(choice), random_field=not stability, stability=stability)
 
@@ -269,7 +270,9 @@ class Scores:
         def block(run: Run) -> Array:
             own, trend = likelihood.problem.local(run, values), likelihood.problem.trend
             p = run_parameters(model, self.experiment, run, own)
-            begun = {n: own_start(model, run, p, n, trend)[0] for n in own_names(model, run, trend) if n not in own}
+            begun = {
+                n: run_specific_start(model, run, p, n, trend)[0] for n in run_specific_names(model, run, trend) if n not in own
+            }
             found = filter_run(
                 model, self.experiment, run, own | begun, by=by, gauges=likelihood.gauges(run), trend=trend, rtol=likelihood.rtol
             )
@@ -282,7 +285,7 @@ class Scores:
         problem, found = self.fitted.likelihood.problem, []
         if not problem.tables:
             return []
-        model = self._opened(added, stability=True)
+        model = self._open_model(added, stability=True)
         known = [n for n in by if n in model.names]
         for loads in problem.tables:
             given = apparatus(self.experiment, loads.frequency) | dict(values)
@@ -293,7 +296,7 @@ class Scores:
             found.append(columns)
         return found
 
-    def _derived(self, effects: Sequence[Effect]) -> list[_Column]:
+    def _derivative_columns(self, effects: Sequence[Effect]) -> list[_Column]:
         """Return the columns of effects from one model that has them all, in parts where they do not go together.
 
         Each has its inner parameters at the values of its own grid; at neutral sizes none sees those of another.
@@ -301,15 +304,15 @@ class Scores:
         if not effects:
             return []
         try:
-            model = self._opened(effects, stability=not self.experiment.runs)
+            model = self._open_model(effects, stability=not self.experiment.runs)
         except SrfError as error:
             if len(effects) == 1:
                 self.excluded.append(Excluded(effects[0].reported, error.message))
                 return []
             half = len(effects) // 2
-            return self._derived(effects[:half]) + self._derived(effects[half:])
+            return self._derivative_columns(effects[:half]) + self._derivative_columns(effects[half:])
         longs = {e.name: {p.name: long for long, p in own_parameters(e, model).items()} for e in effects}
-        grids = {e.name: [inner for group in _phases(e) for inner in group] for e in effects}
+        grids = {e.name: [inner for group in _phase_groups(e) for inner in group] for e in effects}
         columns: dict[str, list[Array]] = {e.name: [] for e in effects}
         for j in range(max(len(grid) for grid in grids.values())):
             some = [e for e in effects if j < len(grids[e.name])]
@@ -318,36 +321,36 @@ class Scores:
             found = self._columns(model, effects, self._neutral(model, effects) | inner, sizes)
             for k, e in enumerate(some):
                 columns[e.name].append(found[:, k])
-        return [column for e in effects for column in _by_phase(e, np.stack(columns[e.name], axis=1))]
+        return [column for e in effects for column in _columns_by_phase(e, np.stack(columns[e.name], axis=1))]
 
-    def _along(self, effects: Sequence[Effect], shapes: Mapping[str, Shape]) -> list[_Column]:
+    def _table_columns(self, effects: Sequence[Effect], shapes: Mapping[str, ProfileFunction]) -> list[_Column]:
         """Return the columns of effects that are functions of slip, time or stage position, for all inner values."""
-        grids = [(shapes[e.name], [inner for group in _phases(e) for inner in group]) for e in effects]
+        grids = [(shapes[e.name], [inner for group in _phase_groups(e) for inner in group]) for e in effects]
         functions = [(shape, [inner.get(n, 0.0) for n in shape.inner]) for shape, grid in grids for inner in grid]
-        every = self.remainder.padded([_carried(f, self.fitted, functions) for f in self.remainder.runs])
+        every = self.projection.padded([_propagated_columns(f, self.fitted, functions) for f in self.projection.runs])
         parts = np.split(every, np.cumsum([len(grid) for _, grid in grids])[:-1], axis=1)
-        return [column for e, columns in zip(effects, parts, strict=True) for column in _by_phase(e, columns)]
+        return [column for e, columns in zip(effects, parts, strict=True) for column in _columns_by_phase(e, columns)]
 
     @cached_property
-    def alone(self) -> list[Score]:
+    def single_run(self) -> list[Score]:
         """The scores of effects that act in one run alone, largest first, where that gains more than to act in all.
 
         By more than the choice of the run costs. Laws are the same in all runs, and so is what the rig's elasticity makes of the
         load; other faults of the apparatus may befall one.
         """
-        runs, base, found, end = self.remainder.fitted.maximum.point.runs, self.remainder.base, [], 0
+        runs, base, found, end = self.projection.fitted.maximum.point.runs, self.projection.basis, [], 0
         if len(runs) < 2:
             return []
         every = {s.effect.reported: s.gain + float(np.log(len(runs))) for s in self.singles}
-        apparatus = [c for c in self.columns if may_befall_one_run(c.effect)]
+        apparatus = [c for c in self.columns if can_act_in_one_run(c.effect)]
         for f in runs:
             rows = slice(end, end := end + 2 * f.white.size)
             best: list[Score] = []
-            for first in range(0, len(apparatus), COLUMNS_TOGETHER):
+            for first in range(0, len(apparatus), COLUMN_BLOCK):
                 parts = []
-                for c in apparatus[first : first + COLUMNS_TOGETHER]:
+                for c in apparatus[first : first + COLUMN_BLOCK]:
                     columns = np.zeros_like(c.columns)
-                    columns[rows] = c.columns[rows] + base[rows] @ c.taken
+                    columns[rows] = c.columns[rows] + base[rows] @ c.coefficients
                     parts.append(replace(c, effect=replace(c.effect, run=f.run.name), columns=columns))
                 best += self._best_of(self._projected(parts))
             foremost: dict[str, Score] = {}
@@ -359,38 +362,38 @@ class Scores:
     def _projected(self, columns: Sequence[_Column]) -> list[_Column]:
         """Return the columns that do something here, projected off what was fitted, many at a time."""
         found: list[_Column] = []
-        for first in range(0, len(columns), COLUMNS_TOGETHER):
-            size = [float(np.sum(c.columns**2)) for c in columns[first : first + COLUMNS_TOGETHER]]
+        for first in range(0, len(columns), COLUMN_BLOCK):
+            size = [float(np.sum(c.columns**2)) for c in columns[first : first + COLUMN_BLOCK]]
             some = [
                 replace(c, whole=whole)
-                for c, whole in zip(columns[first : first + COLUMNS_TOGETHER], size, strict=True)
-                if whole > NO_COLUMN and np.isfinite(whole)
+                for c, whole in zip(columns[first : first + COLUMN_BLOCK], size, strict=True)
+                if whole > MIN_SQUARED_NORM and np.isfinite(whole)
             ]
             if not some:
                 continue
             whole_columns = np.concatenate([c.columns for c in some], axis=1)
-            taken = self.remainder.base.T @ whole_columns
-            free = whole_columns - self.remainder.base @ taken
+            coefficients = self.projection.basis.T @ whole_columns
+            free = whole_columns - self.projection.basis @ coefficients
             along = self.shared.u.T @ free if self.shared.gain else None
             at = 0
             for c in some:
                 part = slice(at, at := at + c.columns.shape[1])
                 beside = None if along is None else along[:, part]
-                found.append(replace(c, columns=free[:, part], along=beside, taken=taken[:, part]))
+                found.append(replace(c, columns=free[:, part], along=beside, coefficients=coefficients[:, part]))
         return found
 
-    def _judge(self, column: _Column) -> tuple[float, Array, Array]:
+    def _gain_and_sizes(self, column: _Column) -> tuple[float, Array, Array]:
         """Return what a column gains, its sizes, and the covariance of these."""
-        gram, g = column.columns.T @ column.columns, column.columns.T @ self.remainder.left
-        plain = self._solved(gram, g)
+        gram, g = column.columns.T @ column.columns, column.columns.T @ self.projection.projected
+        plain = self._normal_equations(gram, g)
         if column.along is None:
             return plain
         kept = column.along * self.shared.absorbed[:, None]
-        beside = self._solved(gram - column.along.T @ kept, g - kept.T @ self.shared.left)
+        beside = self._normal_equations(gram - column.along.T @ kept, g - kept.T @ self.shared.projected)
         gain = max(plain[0] - self.shared.gain, beside[0])
         return (gain, *(beside if gain == beside[0] else plain)[1:])
 
-    def _solved(self, gram: Array, g: Array) -> tuple[float, Array, Array]:
+    def _normal_equations(self, gram: Array, g: Array) -> tuple[float, Array, Array]:
         d = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         values, vectors = np.linalg.eigh(gram / np.outer(d, d))
         keep = values > 1e-9 * max(values[-1], 1e-300)
@@ -410,31 +413,31 @@ class Scores:
     def absorbed_by(self, names: Sequence[str]) -> list[Score]:
         """Return the score of each effect that parameters `names` absorb, and the others do not, where they absorb most of it."""
         least: dict[str, tuple[float, _Column]] = {}
-        others = self.remainder.without(names)
+        others = self.projection.basis_without(names)
         for column in self.columns:
-            assert column.taken is not None
-            left, own = float(np.sum(column.columns**2)), column.taken - others @ (others.T @ column.taken)
+            assert column.coefficients is not None
+            left, own = float(np.sum(column.columns**2)), column.coefficients - others @ (others.T @ column.coefficients)
             absorbed = float(np.sum(own**2))
             share = left / max(left + absorbed, 1e-300)
-            if share < least.get(column.effect.name, (1 - RESEMBLING**2,))[0]:
+            if share < least.get(column.effect.name, (1 - RIVAL_CORRELATION**2,))[0]:
                 least[column.effect.name] = share, column
         return [self._score(column) for _, column in least.values()]
 
     def _score(self, column: _Column) -> Score:
-        gain, size, covariance = self._judge(column)
-        if not self._possible(column, size):
+        gain, size, covariance = self._gain_and_sizes(column)
+        if not self._admissible(column, size):
             gain = 0.0
         error = float(np.sqrt(max(covariance[0, 0], 0.0)))
         direction = column.columns @ size
         norm = float(np.linalg.norm(direction))
-        shifts = np.zeros(0) if column.taken is None else self.remainder.shifts(column.taken @ size)
+        shifts = np.zeros(0) if column.coefficients is None else self.projection.shifts(column.coefficients @ size)
         return Score(
-            column.effect, gain, self._expected(column, size), float(size[0]), error, error * np.sqrt(24.0),
+            column.effect, gain, self._expected_values(column, size), float(size[0]), error, error * np.sqrt(24.0),
             column.tolerance, direction / norm if norm > 0 else direction,
             dict(zip(self.fitted.likelihood.names, shifts.tolist(), strict=False)),
         )  # fmt: skip
 
-    def _possible(self, column: _Column, size: Array) -> bool:
+    def _admissible(self, column: _Column, size: Array) -> bool:
         """Return whether the expected size lies on a side of the neutral value on which there is any."""
         p = next((p for p in column.effect.parameters if p.name == column.name), None)
         if p is None or size.size > 1:
@@ -443,7 +446,7 @@ class Scores:
         low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
         return not ((size[0] < 0 and neutral <= low) or (size[0] > 0 and neutral >= high))
 
-    def _expected(self, column: _Column, size: Array) -> dict[str, float]:
+    def _expected_values(self, column: _Column, size: Array) -> dict[str, float]:
         """Return what is expected of an effect's parameters, within their bounds; two phases are one amplitude and its phase."""
         effect, inner = column.effect, dict(column.inner)
         if "K" in effect.frees:
@@ -456,7 +459,7 @@ class Scores:
         return inner | {column.name: float(np.clip(neutral_values(effect)[column.name] + value, low, high))}
 
 
-def may_befall_one_run(effect: Effect) -> bool:
+def can_act_in_one_run(effect: Effect) -> bool:
     """Return whether an effect is a fault of the apparatus, and no law of the contact, the spring or the frame under load."""
     elastic = any(
         slot == "K" or (slot == "V" and {"W", "W_dot"} & {str(s) for s in formula.free_symbols})
@@ -471,7 +474,7 @@ def _whitened(f: Filtered) -> Array:
     return np.concatenate([-a, b / np.sqrt(2)])
 
 
-def _phases(effect: Effect) -> list[list[dict[str, float]]]:
+def _phase_groups(effect: Effect) -> list[list[dict[str, float]]]:
     """Return the inner values at which an effect is tried, in groups that differ by their phase alone."""
     groups: dict[tuple[float, ...], list[dict[str, float]]] = {}
     for inner in inner_grid(effect):
@@ -479,15 +482,15 @@ def _phases(effect: Effect) -> list[list[dict[str, float]]]:
     return list(groups.values())
 
 
-def _by_phase(effect: Effect, columns: Array) -> list[_Column]:
+def _columns_by_phase(effect: Effect, columns: Array) -> list[_Column]:
     """Return the columns (n, k) of an effect, one for each of its inner values, those of each group together."""
-    groups = _phases(effect)
+    groups = _phase_groups(effect)
     parts = np.split(columns, np.cumsum([len(group) for group in groups])[:-1], axis=1)
     return [_Column(effect, effect.sizes[0], group[0], part) for group, part in zip(groups, parts, strict=True)]
 
 
-def _carried(
-    f: Filtered, fitted: StateSpaceFit, functions: Sequence[tuple[Shape, Sequence[float]]], *, late: bool = False
+def _propagated_columns(
+    f: Filtered, fitted: StateSpaceFit, functions: Sequence[tuple[ProfileFunction, Sequence[float]]], *, late: bool = False
 ) -> Array:
     """Return the columns (2 m, q) of functions of slip or time that add to mu, or of the stage that multiply V, by 1 + g.
 
@@ -498,10 +501,10 @@ def _carried(
     model, states = problem.model, list(problem.model.states)
     n, a = kept.mean.shape
     slip = slip_along(run, kept.mean, model.states)
-    steps = np.linspace(0.0, 1.0, POINTS_BETWEEN, endpoint=False) + 0.5 / POINTS_BETWEEN
+    steps = np.linspace(0.0, 1.0, QUADRATURE_POINTS, endpoint=False) + 0.5 / QUADRATURE_POINTS
     fine_t = (run.t[:-1, None] + np.diff(run.t)[:, None] * steps).ravel()
     V = run.drive(fine_t)
-    stage = np.concatenate([[0.0], np.cumsum(V * np.repeat(np.diff(run.t) / POINTS_BETWEEN, POINTS_BETWEEN))])
+    stage = np.concatenate([[0.0], np.cumsum(V * np.repeat(np.diff(run.t) / QUADRATURE_POINTS, QUADRATURE_POINTS))])
     signals, known, shown = len(run.signals), every.kept, np.zeros(n)
     moved = np.zeros((every.nu.size, a, len(functions) + late))  # the states expected, of each column
     inputs = moved[::signals]
@@ -523,7 +526,7 @@ def _carried(
         else:
             middle = 0.5 * (stage[1:] + stage[:-1])
             gained = V * np.broadcast_to(np.asarray(shape.g(middle, *inner), dtype=float), middle.shape)
-            total = (gained.reshape(-1, POINTS_BETWEEN) * (np.diff(run.t) / POINTS_BETWEEN)[:, None]).sum(axis=1)
+            total = (gained.reshape(-1, QUADRATURE_POINTS) * (np.diff(run.t) / QUADRATURE_POINTS)[:, None]).sum(axis=1)
             if by_V is None:
                 by_V = _rates_by_V(model, fitted, run, kept.mean[:, : len(states)])
             inputs[1:, : len(states), j] = 0.5 * (by_V[1:] + by_V[:-1]) * total[:, None]

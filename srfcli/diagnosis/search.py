@@ -24,25 +24,32 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.goodness_of_fit import CORRELATED, field_share, loudness, shortcomings, taken_up, uneven_noise
-from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
-from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
+from srfcli.diagnosis.goodness_of_fit import (
+    CORRELATED_INNOVATIONS,
+    failed_tests,
+    gauge_noise_tests,
+    noise_is_implausible,
+    relative_field_amplitude,
+    uneven_noise,
+)
+from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, applicable, neutral_values, own_parameters, profile_function
+from srfcli.diagnosis.scores import ResidualProjection, Score, Scores, can_act_in_one_run
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
-    CLOSE_CALL,
-    FARTHEST_STEP,
+    EARLY_STOP_DEFICIT,
     FIELD,
-    HOPELESS,
     MANY_READINGS,
-    NEEDED,
+    MAX_LOG_STEP,
     NOT_CONVERGED,
+    PRUNING_DEFICIT,
+    SIGNIFICANT_GAIN,
     TRIAL_STEPS,
     Likelihood,
     Maximum,
     Predictive,
     StateSpaceFit,
     fit_state_space,
-    likeliest_beside,
+    likeliest_along_ridges,
     log_evidence,
     mass_at_bounds,
     maximise,
@@ -55,39 +62,42 @@ from srfcli.inference.state_space import (
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 
-WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, each at p = 1e-6
-CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
-MOST_EFFECTS = 2  # effects of a model
-MOST_FOLLOWED = 5  # extensions of each model that are fitted
-NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
+MIN_SCORE_GAIN = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, each at p = 1e-6
+LOG_BAYES_MARGIN = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
+MAX_EFFECTS = 2  # effects of a model
+MAX_EXTENSIONS = 5  # extensions of each model that are fitted
+SEARCH_TOLERANCE = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 SEARCH_RTOL = 1e-3  # tolerance of the integration: 0.02 in log likelihood
 BUDGET = 300.0  # s of CPU, or more
-BASELINES = 5.0  # times what the baseline took, if that is more: two effects, each fitted twice, and what they leave to be scored
+# times what the baseline took, if that is more: two effects, each fitted twice, and what they leave to be scored
+BASELINE_MULTIPLES = 5.0
 SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
-BUILT, BUILT_SPAN = 16, 1e3  # sizes of what is built in, a mass or an interface, that are tried; the largest over the least
-FEWEST = 3  # models that are fitted from the file's start values although none has a plausible field: the likeliest
-WIDE_FIELD = 0.33  # of the widest field that a track may have, from where effects are scored without it too: a polished track's
-NEAR_STEPS = 3  # of scoring that tell at first whether a model may be it
-FOLLOWED = 0.1  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
+# sizes of what is built in, a mass or an interface, that are tried; the largest over the least
+STRUCTURAL_SIZES, STRUCTURAL_SPAN = 16, 1e3
+MIN_RESTARTS = 3  # models that are fitted from the file's start values although none has a plausible field: the likeliest
+# of the widest field that a track may have, from where effects are scored without it too: a polished track's
+WIDE_FIELD_SHARE = 0.33
+SCREENING_STEPS = 3  # of scoring that tell at first whether a model may be it
+MIN_START_FIELD = 0.1  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
 
 @dataclass(frozen=True)
 class Fitted:
     """A model fitted: log evidence, what speaks against it (nothing where it passes), what it leaves, the scores of effects.
 
-    `separate` is the log evidence where each run has a field of its own; of it `mass_at_bounds` comes from parameters at a bound.
-    `shared` is what a field that all runs share gains beyond NEEDED at first order, None where an effect says what all runs share
-    along slip; `granted` is what is granted of that.
+    `separate_field_evidence` is the log evidence where each run has a field of its own; of it `mass_at_bounds` comes from
+    parameters at a bound. `shared` is what a field that all runs share gains beyond SIGNIFICANT_GAIN at first order, None where
+    an effect says what all runs share along slip; `shared_field_gain` is the gain that counts.
     """
 
     hypothesis: Hypothesis
     fit: StateSpaceFit
-    separate: float
+    separate_field_evidence: float
     mass_at_bounds: float
     against: tuple[str, ...]
-    remainder: Remainder = field(repr=False)
+    projection: ResidualProjection = field(repr=False)
     shared: float | None = None
-    granted: float = 0.0
+    shared_field_gain: float = 0.0
     scores: Scores | None = field(default=None, repr=False)
 
     @property
@@ -98,7 +108,7 @@ class Fitted:
     @property
     def evidence(self) -> float:
         """Return the log evidence, with what a field that all runs share is granted."""
-        return self.separate + self.granted
+        return self.separate_field_evidence + self.shared_field_gain
 
     @property
     def passes(self) -> bool:
@@ -141,7 +151,8 @@ class _Move:
     fresh: int = field(compare=False, default=0)  # how many of the last effects are at sizes that are only expected
     shifts: Mapping[str, float] = field(compare=False, default_factory=dict)  # of other parameters that go with that
     origin: StateSpaceFit | None = field(compare=False, default=None)  # whose parameters it begins with, as they are
-    reached: float = field(compare=False, default=-np.inf)  # log evidence that was reached on the way to what is expected
+    # log evidence that was reached on the way to what is expected
+    initial_evidence: float = field(compare=False, default=-np.inf)
     gain: float = field(compare=False, default=np.inf)  # of its last effect, at first order
     gains: Mapping[tuple[str, str], float] = field(compare=False, default_factory=dict)  # without field, of all: by name and run
 
@@ -156,7 +167,7 @@ class _Trial:
     found: Maximum
 
 
-class _Spent(Exception):
+class _BudgetSpent(Exception):
     """The budget is used up."""
 
 
@@ -164,11 +175,11 @@ class ModelSearch:
     """One diagnosis on its way; `experiment` holds no held-out runs.
 
     Of long recordings every so-many-th reading is searched, and what comes close is then fitted to all.
-    `options` of every fit and what scores are taken from, `remainder`, are what an ablation changes.
+    `options` of every fit and what scores are taken from, `projection`, are what an ablation changes.
     """
 
     options: ClassVar[Mapping[str, Any]] = {}
-    remainder = Remainder
+    projection = ResidualProjection
 
     def __init__(
         self,
@@ -178,7 +189,7 @@ class ModelSearch:
         effects: Sequence[str] | None = None,
         trend: str | None = None,
     ) -> None:
-        self.registry, self.whole, self._told = registry, experiment, progress
+        self.registry, self.whole, self._report = registry, experiment, progress
         self.trend = trend or experiment.trend  # of every fit
         self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs, self.options.get("many", MANY_READINGS)))
         self.candidates, self.excluded = applicable(registry, experiment, effects)
@@ -186,7 +197,7 @@ class ModelSearch:
         self.on_request = [e.name for e in every if effects is None and e.on_request]
         self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]
         self.budget, self.begun, self.cut_short = BUDGET, time.process_time(), False
-        self._bounded = False  # whether what is done now ends with the budget
+        self._budgeted = False  # whether what is done now ends with the budget
         self.fitted: dict[str, Fitted] = {}
         self.queue: list[_Move] = []
         self.count = 0
@@ -198,62 +209,62 @@ class ModelSearch:
 
     def progress(self, text: str) -> None:
         """Tell what is done; where the budget is spent, end what is bounded by it."""
-        self._told(text)
-        if self._bounded and self.spent:
-            raise _Spent
+        self._report(text)
+        if self._budgeted and self.spent:
+            raise _BudgetSpent
 
     @contextlib.contextmanager
     def within_budget(self) -> Iterator[None]:
         """Do what follows until it is done or the budget is spent, as `cut_short` then says; what was fitted is kept."""
-        self._bounded = True
+        self._budgeted = True
         try:
             yield
-        except _Spent:
+        except _BudgetSpent:
             self.cut_short = True
         finally:
-            self._bounded = False
+            self._budgeted = False
 
     # ------------------------------------------------------------------ models and their fits
 
     def fit(self, move: _Move | None) -> Fitted:
         """Return a model fitted from where its parent stands, and judged; the baseline from the file's own start values."""
         hypothesis = move.hypothesis if move else Hypothesis()
-        options = {"processes": _colours(move.values) if move else None, **self.options}
+        options = {"processes": _colour_processes(move.values) if move else None, **self.options}
         if move:
-            options["least"] = self.best().evidence - CLOSE_CALL
+            options["least"] = self.best().evidence - EARLY_STOP_DEFICIT
 
         def fitted(values: dict[str, float] | None) -> StateSpaceFit:
             return self._state_space(self._problem(hypothesis, values or {}), start=values, beside=False, **options)
 
         if move and not self.experiment.runs:  # without a field a parent that is far off leads to the crossings next to its own
             stated = {q.name: q.value for q in self.experiment.parameters}
-            found = fitted(self._started(replace(move, values=stated, shifts={})))
-            if shortcomings(found):
-                found = max(found, fitted(self._started(move)), key=lambda f: f.log_likelihood)
+            found = fitted(self._start_values(replace(move, values=stated, shifts={})))
+            if failed_tests(found):
+                found = max(found, fitted(self._start_values(move)), key=lambda f: f.log_likelihood)
         elif move and move.origin:
-            found = self._as_it_is(move, move.origin.smooth, move.origin.likelihood.processes)
+            found = self._fit_without_widening(move, move.origin.smooth, move.origin.likelihood.processes)
         else:
-            found = fitted(self._started(move) if move else None)
+            found = fitted(self._start_values(move) if move else None)
             if move and options["processes"] is None:  # its score was taken without field and colour
-                found = max(found, self._as_it_is(move, True, ()), key=lambda f: f.criterion)
+                found = max(found, self._fit_without_widening(move, True, ()), key=lambda f: f.criterion)
         if move and "processes" not in self.options:
-            found = with_less_colour(found, NEAR, self.progress)
-        judged = self._judged(hypothesis, found)
+            found = with_less_colour(found, SEARCH_TOLERANCE, self.progress)
+        judged = self._assessed(hypothesis, found)
         if move is None and judged.passes:  # else it is not what is reported
-            judged = self._judged(hypothesis, likeliest_beside(found, NEAR, self.progress))
+            judged = self._assessed(hypothesis, likeliest_along_ridges(found, SEARCH_TOLERANCE, self.progress))
         return judged
 
-    def _as_it_is(self, move: _Move, smooth: bool, processes: Sequence[str]) -> StateSpaceFit:
+    def _fit_without_widening(self, move: _Move, smooth: bool, processes: Sequence[str]) -> StateSpaceFit:
         """Return a fit that begins where a move says, under no wider field, without one if `smooth`, with colour as given."""
-        likelihood, x = self._begun(move, smooth, processes)
+        likelihood, x = self._initial_point(move, smooth, processes)
         begun = maximise(likelihood, x, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
-        if not begun.expected > self.best().evidence - CLOSE_CALL:
+        if not begun.expected > self.best().evidence - EARLY_STOP_DEFICIT:
             return StateSpaceFit(likelihood, begun)
         return self._state_space(likelihood.problem, part=StateSpaceFit(likelihood, begun))
 
-    def _begun(self, move: _Move, smooth: bool, processes: Sequence[str]) -> tuple[Likelihood, Array]:
+    def _initial_point(self, move: _Move, smooth: bool, processes: Sequence[str]) -> tuple[Likelihood, Array]:
         """Return the likelihood of a move's model, without a field if `smooth`, with colour as given, and where it begins."""
-        values = self._sized(move, 1.0, move.shifts)
+        values = self._values_at_share(move, 1.0, move.shifts)
         problem = self._problem(move.hypothesis, values)
         likelihood = Likelihood(problem, smooth=smooth, processes=processes, rtol=SEARCH_RTOL)
         return likelihood, likelihood.coordinates(values)
@@ -261,12 +272,12 @@ class ModelSearch:
     def _state_space(self, problem: Problem, **choice: Any) -> StateSpaceFit:
         """Return a fit with the options of every fit, and with a `choice` of others."""
         choice = {"cautious": True, **choice, **self.options}
-        return fit_state_space(problem, close=NEAR, rtol=SEARCH_RTOL, progress=self.progress, **choice)
+        return fit_state_space(problem, close=SEARCH_TOLERANCE, rtol=SEARCH_RTOL, progress=self.progress, **choice)
 
     def _problem(self, hypothesis: Hypothesis, at: Mapping[str, float]) -> Problem:
         return hypothesis.problem(self.registry, self.experiment, at=at, trend=self.trend)
 
-    def _started(self, move: _Move) -> dict[str, float]:
+    def _start_values(self, move: _Move) -> dict[str, float]:
         """Return where a model is fitted from: the sizes that its scores expect, or a part of them where that is likelier.
 
         With the other parameters moved as the scores say, or as they were.
@@ -275,10 +286,10 @@ class ModelSearch:
         for shifts in (move.shifts, {}) if move.shifts else ({},):
             last = -np.inf
             for share in SIZE_SHARES:
-                values = self._sized(move, share, shifts)
+                values = self._values_at_share(move, share, shifts)
                 problem = self._problem(move.hypothesis, values)
-                values = _followable(values, problem)
-                likelihood = Likelihood(problem, processes=_colours(move.values) or (), rtol=SEARCH_RTOL)
+                values = _with_wide_field(values, problem)
+                likelihood = Likelihood(problem, processes=_colour_processes(move.values) or (), rtol=SEARCH_RTOL)
                 found = likelihood.at(likelihood.coordinates(values), slopes=False).log_likelihood
                 if found > best[0]:
                     best = found, values
@@ -289,12 +300,12 @@ class ModelSearch:
             raise SrfError("no size of it follows the recordings from where its parent stands")
         return best[1]
 
-    def _sized(self, move: _Move, share: float, shifts: Mapping[str, float]) -> dict[str, float]:
+    def _values_at_share(self, move: _Move, share: float, shifts: Mapping[str, float]) -> dict[str, float]:
         """Return the parameters of a model where `share` of what its scores expect has been gone."""
         model, values = move.hypothesis.model(self.registry, self.experiment), dict(move.values)
         for name, shift in shifts.items():  # relative ones as powers: what is positive stays so
             value = values[name]
-            power = np.clip(share * shift / value, -FARTHEST_STEP, FARTHEST_STEP) if value > 0 else 0.0
+            power = np.clip(share * shift / value, -MAX_LOG_STEP, MAX_LOG_STEP) if value > 0 else 0.0
             values[name] = value * float(np.exp(power)) if value > 0 else value + share * shift
         for number, (effect, sizes) in enumerate(zip(move.hypothesis.effects, move.sizes, strict=True)):
             part = share if number >= len(move.sizes) - move.fresh else 1.0
@@ -305,25 +316,25 @@ class ModelSearch:
                 values[longs.get(name, name)] = value if still is None else still + part * (value - still)
         return values
 
-    def _judged(self, hypothesis: Hypothesis, found: StateSpaceFit) -> Fitted:
+    def _assessed(self, hypothesis: Hypothesis, found: StateSpaceFit) -> Fitted:
         if found.maximum.status is Status.INTEGRATION:
             name = "the model" if hypothesis == Hypothesis() else hypothesis.name
             raise SrfError(
                 f"{name} cannot be followed along the recordings",
                 "Give start values, or bounds, between which it slides as the recordings do.",
             )
-        remainder = self.remainder(found)
+        projection = self.projection(found)
         sizes = hypothesis.priors(found.likelihood.problem.model)
-        by_slip = any((shape := along_table(e)) and shape.argument == "slip" for e in hypothesis.effects)
+        by_slip = any((shape := profile_function(e)) and shape.argument == "slip" for e in hypothesis.effects)
         random = not by_slip and found.maximum.away < NOT_CONVERGED  # a track is a function of slip or a random one
         return Fitted(
             hypothesis, found, log_evidence(found, sizes) + self._prior(hypothesis), mass_at_bounds(found, sizes),
-            tuple(shortcomings(found)), remainder, max(remainder.shared.gain - NEEDED, 0.0) if random else None,
+            tuple(failed_tests(found)), projection, max(projection.shared.gain - SIGNIFICANT_GAIN, 0.0) if random else None,
         )  # fmt: skip
 
-    def _passed(self, hypothesis: Hypothesis, found: StateSpaceFit) -> Fitted:
+    def _waypoint(self, hypothesis: Hypothesis, found: StateSpaceFit) -> Fitted:
         """Return a model where scoring has passed, which is scored and no more."""
-        return Fitted(hypothesis, found, found.log_likelihood, 0.0, ("as it is passed",), self.remainder(found))
+        return Fitted(hypothesis, found, found.log_likelihood, 0.0, ("as it is passed",), self.projection(found))
 
     def _prior(self, hypothesis: Hypothesis) -> float:
         """Return the log prior of a model: each effect is one of those that there are, and halves its share.
@@ -331,15 +342,15 @@ class ModelSearch:
         One that acts in one run alone is in any of them.
         """
         each = float(np.log(2 * max(len(self.candidates), 1)))
-        return -len(hypothesis.reported) * each - sum(self._rarer for e in hypothesis.effects if e.run)
+        return -len(hypothesis.reported) * each - sum(self._log_run_count for e in hypothesis.effects if e.run)
 
     @property
-    def _one_more(self) -> float:
+    def _effect_log_penalty(self) -> float:
         """Return what an effect more is expected to cost in log evidence: its prior, and Occam's factor."""
         return -float(np.log(2 * max(len(self.candidates), 1))) - 3.0
 
     @property
-    def _rarer(self) -> float:
+    def _log_run_count(self) -> float:
         """Return by how much less likely an effect is in one run alone than in all, in the logarithm."""
         return float(np.log(max(len(self.experiment.runs), 1)))
 
@@ -353,42 +364,44 @@ class ModelSearch:
         """
         self.progress("baseline")
         base = self._record(self.fit(None))
-        self.budget = max(BUDGET, BASELINES * (time.process_time() - self.begun))
+        self.budget = max(BUDGET, BASELINE_MULTIPLES * (time.process_time() - self.begun))
         with self.within_budget():
             base = self._expand(self._with_own_noise(base))
-            if taken_up(base.fit):  # field or noise make up for what is missing: without them it shows, or it is another law
-                self._take(self._expand_without_field, base)
-                self._take(self._fit_likeliest_afresh, base)
-                if not self._explained and self._within_reach(base):  # what is likelier where it begins, else what is expected
-                    move = max(self.queue, key=lambda m: (max(self._reached(m, base), base.evidence), -m.expected))
-                    self._fit_next(self._taken_out(move))
+            # field or noise make up for what is missing: without them it shows, or it is another law
+            if noise_is_implausible(base.fit):
+                self._take_step(self._expand_without_field, base)
+                self._take_step(self._fit_likeliest_afresh, base)
+                # what is likelier where it begins, else what is expected
+                if not self._explained and self._queue_is_promising(base):
+                    move = max(self.queue, key=lambda m: (max(self._initial_evidence(m, base), base.evidence), -m.expected))
+                    self._fit_next(self._removed_from_queue(move))
                 self._between_runs()
                 if self.best().name == base.name or not self.best().passes:
-                    self._take(self._fit_afresh, base)
+                    self._take_step(self._refit_from_start_values, base)
             elif not base.passes:
                 self._try_ageing_laws(self.best())
-            self._ask(self._steps)
+            self._search_by_steps(self._steps)
         if self.best().passes:
-            self._ask(self._simplifying)
+            self._search_by_steps(self._simplifying)
         if self.baseline.scores is None:  # from the best model's parameters it came to another maximum
             self._expand(self.baseline)
         best = self.best()
-        self.cut_short |= self.spent and (not best.passes or self._within_reach(best) or self._expandable(best))
+        self.cut_short |= self.spent and (not best.passes or self._queue_is_promising(best) or self._expandable(best))
         if self.experiment.runs is not self.whole.runs:
             self._fit_all()
         return self.best()
 
-    def _ask(self, steps: Callable[[], Sequence[_Step]]) -> None:
+    def _search_by_steps(self, steps: Callable[[], Sequence[_Step]]) -> None:
         """Search, and take the first step that was not taken yet for its model, until none is left."""
         while True:
             self._search()
             step, node = next(((s, f) for s, f in steps() if (s, f.name) not in self._taken), (None, None))
             if step is not None and node is not None:
-                self._take(step, node)
-            elif not self._go_on():
+                self._take_step(step, node)
+            elif not self._fall_back():
                 return
 
-    def _go_on(self) -> bool:
+    def _fall_back(self) -> bool:
         """Where no model passes, expand the next best, or fit what is expected below the best; return whether there was any."""
         other = next(filter(self._expandable, self.ranked()), None)
         if self.best().passes or self.spent or (other is None and not self.queue):
@@ -399,11 +412,11 @@ class ModelSearch:
             self._fit_next(heapq.heappop(self.queue))
         return True
 
-    def _take(self, step: Callable[[Fitted], Any], node: Fitted) -> None:
+    def _take_step(self, step: Callable[[Fitted], Any], node: Fitted) -> None:
         step(node)
         self._taken.add((step, node.name))
 
-    def _untaken(self, node: Fitted, *steps: Callable[[Fitted], Any]) -> Callable[[Fitted], Any] | None:
+    def _first_untaken(self, node: Fitted, *steps: Callable[[Fitted], Any]) -> Callable[[Fitted], Any] | None:
         """Return the first of several steps that was not taken yet for a model; None where all were."""
         return next((step for step in steps if (step, node.name) not in self._taken), None)
 
@@ -411,11 +424,11 @@ class ModelSearch:
         """Return the steps to be taken, in turn, for the model that is the best now, or for the baseline."""
         best, base = self.best(), self.baseline
         if best.passes:  # other laws are tried near it alone, unless field or noise are there to make up for a law
-            masked = taken_up(base.fit) and best.random and not best.hypothesis.ageing
-            steps: list[_Step] = [(self._fit_afresh, base)] if masked else []
+            masked = noise_is_implausible(base.fit) and best.random and not best.hypothesis.ageing
+            steps: list[_Step] = [(self._refit_from_start_values, base)] if masked else []
             steps += [(self._try_ageing_laws, best), (self._expand_without_field, base)]
         else:
-            steps = [(self._fit_afresh, base)]
+            steps = [(self._refit_from_start_values, base)]
             steps += [(self._try_ageing_laws, best)] if best.hypothesis.ageing else []
             steps += [(self._expand_without_field, f) for f in (base, best)]
         return [*steps, (self._try_rivals, best), *self._simplifying()]
@@ -427,20 +440,22 @@ class ModelSearch:
     def _fit_all(self) -> None:
         """Fit the baseline, the best and what passes and comes close to it to all readings; the others were not."""
         best = self.best()
-        close = [f for f in self.ranked() if f is best or (f.passes and best.evidence - f.evidence < CLOSE)][:MOST_FOLLOWED]
+        close = [f for f in self.ranked() if f is best or (f.passes and best.evidence - f.evidence < LOG_BAYES_MARGIN)][
+            :MAX_EXTENSIONS
+        ]
         parts = {f.name: f for f in (*close, self.baseline)}
         self.experiment, fitted = self.whole, {}
         processes: Sequence[str] | None = None
         for node in parts.values():
             self.progress(f"{node.name}: all readings")
             found = self._state_space(self._problem(node.hypothesis, node.fit.values), part=node.fit, processes=processes)
-            judged = self._judged(node.hypothesis, found)
+            judged = self._assessed(node.hypothesis, found)
             if processes is None:  # more readings show more colour
                 judged = self._more_coloured(judged)
             fitted[node.name] = replace(judged, scores=node.scores)
             processes = judged.fit.likelihood.processes
         self.fitted = fitted
-        self._grant_shared_field()
+        self._credit_shared_field()
 
     def extend(self, nodes: Sequence[Fitted]) -> None:
         """Search on from models that another search has fitted."""
@@ -464,17 +479,17 @@ class ModelSearch:
         """Return whether the budget is used up."""
         return time.process_time() - self.begun > self.budget
 
-    def _within_reach(self, best: Fitted) -> bool:
+    def _queue_is_promising(self, best: Fitted) -> bool:
         """Return whether a model that waits is expected to come close to the best."""
         if not self.queue:
             return False
         if self.experiment.thresholds and not best.passes and self.queue[0].fresh:
             return True  # far off the first order says too little
-        return -self.queue[0].expected >= best.evidence - CLOSE
+        return -self.queue[0].expected >= best.evidence - LOG_BAYES_MARGIN
 
     def _expandable(self, node: Fitted) -> bool:
         """Return whether a fitted model was not asked yet what it lacks, and could have that."""
-        return node.scores is None and len(node.hypothesis.effects) < MOST_EFFECTS
+        return node.scores is None and len(node.hypothesis.effects) < MAX_EFFECTS
 
     def _search(self) -> None:
         """Fit what comes close to the best model, or would mend it; expand the best once nothing does.
@@ -484,40 +499,40 @@ class ModelSearch:
         while not self.spent:
             self._between_runs()
             best = self.best()
-            self.queue = [m for m in self.queue if self._outdo(m.gain, m.gains)]
+            self.queue = [m for m in self.queue if self._outscores_best(m.gain, m.gains)]
             heapq.heapify(self.queue)
-            if self._within_reach(best):
+            if self._queue_is_promising(best):
                 self._fit_next(heapq.heappop(self.queue))
-            elif step := self._untaken(best, self._at_other_maxima, self._with_more_colour):
-                self._take(step, best)
+            elif step := self._first_untaken(best, self._at_other_maxima, self._with_more_colour):
+                self._take_step(step, best)
             elif not self._expandable(best):
                 break
-            elif best.passes or (self._fit_afresh, self.baseline.name) in self._taken:
+            elif best.passes or (self._refit_from_start_values, self.baseline.name) in self._taken:
                 self._expand(best)
             else:
-                self._take(self._fit_afresh, self.baseline)
+                self._take_step(self._refit_from_start_values, self.baseline)
 
     def _between_runs(self) -> None:
         """Fit the best model, while it fails a test, at other maxima, with its effects in all runs and with each in one run."""
         steps = (self._at_other_maxima, self._in_all_runs, self._in_one_run)
-        while not (best := self.best()).passes and (step := self._untaken(best, *steps)):
-            self._take(step, best)
+        while not (best := self.best()).passes and (step := self._first_untaken(best, *steps)):
+            self._take_step(step, best)
 
     def _fit_next(self, move: _Move) -> None:
         """Fit a model that waited; what cannot be fitted is left out, with the reason."""
         name = move.hypothesis.name
-        if name in self.fitted and self.fitted[name].evidence > -move.expected - WORTH:
+        if name in self.fitted and self.fitted[name].evidence > -move.expected - MIN_SCORE_GAIN:
             return
         self.progress(f"{name}: expected log evidence {-move.expected:.1f}, best {self.best().evidence:.1f}")
         try:
             self._record(self.fit(move))
-        except _Spent:
+        except _BudgetSpent:
             heapq.heappush(self.queue, move)
             raise
         except SrfError as error:
             self.excluded.append(Excluded(name, error.message))
 
-    def _taken_out(self, move: _Move) -> _Move:
+    def _removed_from_queue(self, move: _Move) -> _Move:
         """Return a move that waited, which no longer does."""
         self.queue = [other for other in self.queue if other is not move]
         heapq.heapify(self.queue)
@@ -530,16 +545,22 @@ class ModelSearch:
         self.excluded += scores.excluded
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
-        self._push(self._extensions(node, node, self._gains(scores), WORTH if node.passes and not node.random else CLOSE))
-        self._push([m for e in self._joining(node) if (e.settings or e.observed) and (m := self._built_in(node, e))])
+        self._push(
+            self._extensions(
+                node, node, self._gains(scores), MIN_SCORE_GAIN if node.passes and not node.random else LOG_BAYES_MARGIN
+            )
+        )
+        self._push(
+            [m for e in self._absent_effects(node) if (e.settings or e.observed) and (m := self._structural_move(node, e))]
+        )
         return node
 
     def _scores(self, node: Fitted) -> Scores:
         """Return the scores of the effects that a fitted model lacks."""
         experiment = node.fit.likelihood.problem.experiment
-        return Scores(self.registry, experiment, node.remainder, node.hypothesis.effects, self._joining(node))
+        return Scores(self.registry, experiment, node.projection, node.hypothesis.effects, self._absent_effects(node))
 
-    def _joining(self, node: Fitted) -> list[Effect]:
+    def _absent_effects(self, node: Fitted) -> list[Effect]:
         """Return the effects that a fitted model lacks and could have."""
         names = {e.reported for e in node.hypothesis.effects}
         there = {p.name for p in node.fit.likelihood.problem.model.parameters}
@@ -547,7 +568,7 @@ class ModelSearch:
 
     def _gains(self, scores: Scores) -> list[tuple[float, Score]]:
         """Return the effects' gains at first order, in all runs and in one alone."""
-        return [(s.gain, s) for s in scores.every] + [(s.gain - self._rarer, s) for s in scores.alone]
+        return [(s.gain, s) for s in scores.every] + [(s.gain - self._log_run_count, s) for s in scores.single_run]
 
     def _extensions(
         self, node: Fitted, at: Fitted, gains: Sequence[tuple[float, Score]], least: float, *, noise: bool = True
@@ -557,15 +578,15 @@ class ModelSearch:
         Unless its field and gauge `noise` are kept, they are estimated anew.
         """
         moves = []
-        for gain, score in sorted((p for p in gains if p[0] > least), key=lambda p: -p[0])[:MOST_FOLLOWED]:
+        for gain, score in sorted((p for p in gains if p[0] > least), key=lambda p: -p[0])[:MAX_EXTENSIONS]:
             hypothesis = Hypothesis((*node.hypothesis.effects, score.effect), node.hypothesis.ageing)
             sizes = (*self._sizes(at), score.values)
             own = {n: score.shifts[n] for n in at.fit.likelihood.problem.names if score.shifts.get(n)}
             self.count += 1
             values = {n: v for n, v in at.fit.values.items() if noise or not (n in FIELD or n.startswith("gauge_"))}
-            least_likely, fresh = at.fit.log_likelihood - HOPELESS, len(hypothesis.effects) - len(at.hypothesis.effects)
+            least_likely, fresh = at.fit.log_likelihood - PRUNING_DEFICIT, len(hypothesis.effects) - len(at.hypothesis.effects)
             moves.append(_Move(
-                -(node.attainable + gain + self._one_more), self.count, hypothesis, values, sizes, least_likely, fresh,
+                -(node.attainable + gain + self._effect_log_penalty), self.count, hypothesis, values, sizes, least_likely, fresh,
                 shifts=own, gain=gain,
             ))  # fmt: skip
         return moves
@@ -585,23 +606,25 @@ class ModelSearch:
         """
         best = self.best()
         passed = best.passes and best.name != node.name and not best.hypothesis.effects
-        rough = taken_up(node.fit) or field_share(node.fit) > WIDE_FIELD
-        if len(node.hypothesis.effects) == MOST_EFFECTS or passed or not rough:
+        implausible = noise_is_implausible(node.fit) or relative_field_amplitude(node.fit) > WIDE_FIELD_SHARE
+        if len(node.hypothesis.effects) == MAX_EFFECTS or passed or not implausible:
             return
         smooth = Likelihood(node.fit.likelihood.problem, smooth=True, rtol=SEARCH_RTOL)
         found = maximise(smooth, smooth.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
         if found.status is Status.INTEGRATION:  # without a field nothing follows the recordings
             return
-        plain = self._passed(node.hypothesis, StateSpaceFit(smooth, found))
+        plain = self._waypoint(node.hypothesis, StateSpaceFit(smooth, found))
         self.progress(f"{node.name}: scores without field and colour")
         scores = self._scores(plain)
         every = sorted(self._gains(scores), key=lambda p: p[0])  # of variants the one with the largest score
         known = {(score.effect.reported, score.effect.run): gain for gain, score in every}
         for alone in (False, True):  # as many in one run alone as in all
-            larger = [(gain, score) for gain, score in every if bool(score.effect.run) is alone and self._outdo(gain, known)]
-            self._push([replace(m, gains=known) for m in self._extensions(node, plain, larger, WORTH, noise=False)])
+            larger = [
+                (gain, score) for gain, score in every if bool(score.effect.run) is alone and self._outscores_best(gain, known)
+            ]
+            self._push([replace(m, gains=known) for m in self._extensions(node, plain, larger, MIN_SCORE_GAIN, noise=False)])
 
-    def _outdo(self, gain: float, gains: Mapping[tuple[str, str], float]) -> bool:
+    def _outscores_best(self, gain: float, gains: Mapping[tuple[str, str], float]) -> bool:
         """Return whether a gain is larger than that of each effect of the best model, of the same scores, where that passes."""
         best = self.best()
         return not best.passes or all(gain > gains.get((e.reported, e.run), -np.inf) for e in best.hypothesis.effects)
@@ -619,7 +642,7 @@ class ModelSearch:
             return None
         return Likelihood(problem, processes=node.fit.likelihood.processes, rtol=SEARCH_RTOL)
 
-    def _built_in(self, node: Fitted, effect: Effect) -> _Move | None:
+    def _structural_move(self, node: Fitted, effect: Effect) -> _Move | None:
         """Return an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
         hypothesis = Hypothesis((*node.hypothesis.effects, effect), node.hypothesis.ageing)
         likelihood = self._likelihood(hypothesis, node, effect.reported)
@@ -628,10 +651,10 @@ class ModelSearch:
         problem = likelihood.problem
         own = [n for n in problem.names if n not in node.fit.likelihood.problem.names]
         place = likelihood.names.index(own[0])
-        x = likelihood.coordinates(_followable(node.fit.values, problem))
+        x = likelihood.coordinates(_with_wide_field(node.fit.values, problem))
         low, high = (likelihood.values(edge)[own[0]] for edge in (likelihood.lower, likelihood.upper))
         trials = []
-        for size in np.geomspace(max(low, high / BUILT_SPAN), high, BUILT):
+        for size in np.geomspace(max(low, high / STRUCTURAL_SPAN), high, STRUCTURAL_SIZES):
             y = x.copy()
             y[place] = np.log(size) if likelihood.logarithmic[place] else size
             trials.append((likelihood.at(y, slopes=False, like=node.fit.maximum.point).log_likelihood, y))
@@ -640,13 +663,13 @@ class ModelSearch:
             return None
         found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
         gain = found.expected - node.fit.log_likelihood
-        if not gain > (WORTH if node.passes else 0.0):
+        if not gain > (MIN_SCORE_GAIN if node.passes else 0.0):
             return None
         self.count += 1
         values = dict(found.point.values)
         sizes = (*self._sizes(node), {own[0]: values[own[0]]})
-        without, reached = node.attainable + self._one_more, found.point.log_likelihood - node.fit.log_likelihood
-        return _Move(-(without + gain), self.count, hypothesis, values, sizes, reached=without + reached)
+        without, reached = node.attainable + self._effect_log_penalty, found.point.log_likelihood - node.fit.log_likelihood
+        return _Move(-(without + gain), self.count, hypothesis, values, sizes, initial_evidence=without + reached)
 
     def _with_own_noise(self, base: Fitted) -> Fitted:
         """Return the baseline with a gauge noise for each run, as all models have from then on, where runs differ in it.
@@ -660,13 +683,13 @@ class ModelSearch:
             replace(e, vary={**e.vary, GAUGE_NOISE: e.by if e.vary else "run"}) for e in (self.experiment, self.whole)
         )
         problem = base.hypothesis.problem(self.registry, experiment, at=base.fit.values, trend=self.trend)
-        start = _followable(base.fit.values, problem)
+        start = _with_wide_field(base.fit.values, problem)
         found = self._state_space(problem, start=start, processes=base.fit.likelihood.processes)
-        loud = any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
-        if loud or log_evidence(found) < log_evidence(base.fit) + CLOSE:
+        loud = any(size > 1 for size, _ in gauge_noise_tests(found.likelihood, found.maximum.point))
+        if loud or log_evidence(found) < log_evidence(base.fit) + LOG_BAYES_MARGIN:
             return base
         self.experiment, self.whole = experiment, whole
-        return self._record(self._judged(base.hypothesis, found))
+        return self._record(self._assessed(base.hypothesis, found))
 
     def _with_more_colour(self, best: Fitted) -> None:
         """Fit the best model with more coloured noise, where that is all that it lacks: no effect is expected to explain it."""
@@ -676,10 +699,10 @@ class ModelSearch:
 
     def _more_coloured(self, node: Fitted) -> Fitted:
         """Return a model with as much coloured noise as Schwarz's criterion wants, if nothing else speaks against it."""
-        if node.against != (CORRELATED,):
+        if node.against != (CORRELATED_INNOVATIONS,):
             return node
         found = self._state_space(node.fit.likelihood.problem, part=node.fit, cautious=False)
-        return self._judged(node.hypothesis, found)
+        return self._assessed(node.hypothesis, found)
 
     def _try_rivals(self, best: Fitted) -> None:
         """Fit what does the same at first order in the place of one effect of the best model, or of its ageing law.
@@ -694,12 +717,14 @@ class ModelSearch:
         for i, effect in enumerate(effects):
             scores = scores or self._scores(best)
             others, own = effects[:i] + effects[i + 1 :], sizes[:i] + sizes[i + 1 :]
-            without = self._height(_Move(0.0, 0, Hypothesis(others, ageing), dict(best.fit.values), own, origin=best.fit))
+            without = self._initial_log_likelihood(
+                _Move(0.0, 0, Hypothesis(others, ageing), dict(best.fit.values), own, origin=best.fit)
+            )
             for score in scores.absorbed_by([*own_parameters(effect, model), *effect.frees]):
                 hypothesis = Hypothesis((*others, score.effect), ageing)
                 if hypothesis.name not in self.fitted:
-                    moves = self._instead(best, effect, score, hypothesis, own)
-                    height, move = max(((self._height(m), m) for m in moves), key=lambda found: found[0])
+                    moves = self._replacements(best, effect, score, hypothesis, own)
+                    height, move = max(((self._initial_log_likelihood(m), m) for m in moves), key=lambda found: found[0])
                     if height > without:  # else it does not do the same beyond first order
                         self._fit_move(move)
         for law in self.laws if ageing else []:
@@ -708,10 +733,10 @@ class ModelSearch:
             if law == self.experiment.choice.ageing.partition("+")[0] or likelihood is None:
                 continue
             x = likelihood.coordinates(best.fit.values)
-            if likelihood.at(x, slopes=False).log_likelihood > best.fit.log_likelihood - WORTH:
+            if likelihood.at(x, slopes=False).log_likelihood > best.fit.log_likelihood - MIN_SCORE_GAIN:
                 self._fit_from(best, hypothesis, sizes)
 
-    def _instead(
+    def _replacements(
         self, node: Fitted, effect: Effect, score: Score, hypothesis: Hypothesis, others: tuple[dict[str, float], ...]
     ) -> Iterator[_Move]:
         """Yield the model of what is scored, of the size that does at first order what an effect of a fitted model does.
@@ -730,22 +755,22 @@ class ModelSearch:
         for shifts in ({}, {n: ratio * shift for n, shift in score.shifts.items() if n != names[size]}):
             yield _Move(0.0, 0, hypothesis, dict(fitted), sizes, shifts=shifts, origin=node.fit)
 
-    def _reached(self, move: _Move, node: Fitted) -> float:
+    def _initial_evidence(self, move: _Move, node: Fitted) -> float:
         """Return the log evidence that an extension of a fitted model has where it begins; -inf under another field or noise."""
         kept = node.fit.values.keys() <= move.values.keys()
-        gain = self._height(replace(move, origin=node.fit)) - node.fit.log_likelihood if kept else -np.inf
-        return max(move.reached, node.attainable + self._one_more + gain)
+        gain = self._initial_log_likelihood(replace(move, origin=node.fit)) - node.fit.log_likelihood if kept else -np.inf
+        return max(move.initial_evidence, node.attainable + self._effect_log_penalty + gain)
 
-    def _height(self, move: _Move) -> float:
+    def _initial_log_likelihood(self, move: _Move) -> float:
         """Return the log likelihood where a move begins, field and noise as in the fit that it comes from."""
         assert move.origin is not None
         try:
-            likelihood, x = self._begun(move, move.origin.smooth, move.origin.likelihood.processes)
+            likelihood, x = self._initial_point(move, move.origin.smooth, move.origin.likelihood.processes)
         except SrfError:  # told where it is fitted
             return np.inf
         return likelihood.at(x, slopes=False).log_likelihood
 
-    def _fit_afresh(self, base: Fitted) -> None:
+    def _refit_from_start_values(self, base: Fitted) -> None:
         """Fit other ageing laws, and effects if nothing passes, from the file's own start values.
 
         A field, or noise, may stand for what is missing; the other parameters then end where no step leads to the right model.
@@ -757,22 +782,22 @@ class ModelSearch:
             self._try_ageing_laws(best)
             return
         models = [hypothesis for hypothesis, _ in self._other_laws(best)]
-        singles = [Hypothesis((effect,)) for effect in ([] if base.passes or best.passes else self._joining(base))]
+        singles = [Hypothesis((effect,)) for effect in ([] if base.passes or best.passes else self._absent_effects(base))]
         for single in sorted(singles, key=lambda h: -self._expected.get(h.name, -np.inf)):
             known = self.fitted.get(single.name)
             models += [] if known and known.passes else [single]
         highest = self._without_colour(best) if best.name != base.name else -np.inf
         others, highest = self._follow([m for m in models if m.name not in self._followed], highest)
         if not self._explained:
-            for trial in sorted(others, key=lambda t: -t.found.point.log_likelihood)[:FEWEST]:
-                highest = self._carry_on(trial, highest)
+            for trial in sorted(others, key=lambda t: -t.found.point.log_likelihood)[:MIN_RESTARTS]:
+                highest = self._finish_from_start_values(trial, highest)
                 if self._explained:
                     return
 
     def _fit_likeliest_afresh(self, base: Fitted) -> None:
         """Fit the effects of which most is expected, and what they lack then, from the file's own start values."""
         likeliest = {m.hypothesis.name: m.hypothesis for m in sorted(self.queue) if -m.expected > base.evidence}
-        self._follow([m for m in list(likeliest.values())[:FEWEST] if not any(e.run for e in m.effects)], -np.inf)
+        self._follow([m for m in list(likeliest.values())[:MIN_RESTARTS] if not any(e.run for e in m.effects)], -np.inf)
 
     @property
     def _explained(self) -> bool:
@@ -787,10 +812,10 @@ class ModelSearch:
         others = []
         for hypothesis in models:
             trial = self._begun_afresh(hypothesis)
-            if trial is not None and taken_up(StateSpaceFit(trial.own, trial.found)):
+            if trial is not None and noise_is_implausible(StateSpaceFit(trial.own, trial.found)):
                 others.append(trial)
             elif trial is not None:
-                highest = self._carry_on(trial, highest)
+                highest = self._finish_from_start_values(trial, highest)
                 if self._explained:
                     break
         return others, highest
@@ -817,16 +842,20 @@ class ModelSearch:
         It is scored under white noise: coloured noise, or a field wider than one may be, takes up a part of what is missing.
         """
         fit, hypothesis = StateSpaceFit(trial.own, trial.found), trial.hypothesis
-        if len(hypothesis.effects) == MOST_EFFECTS or taken_up(fit) or not set(shortcomings(fit)) - {CORRELATED}:
+        if (
+            len(hypothesis.effects) == MAX_EFFECTS
+            or noise_is_implausible(fit)
+            or not set(failed_tests(fit)) - {CORRELATED_INNOVATIONS}
+        ):
             return None
         self.progress(f"{hypothesis.name}: scores under white noise")
-        gains = self._gains(self._scores(self._passed(hypothesis, fit)))
-        likeliest = [score.effect for gain, score in sorted(gains, key=lambda p: -p[0])[:FEWEST] if gain > WORTH]
+        gains = self._gains(self._scores(self._waypoint(hypothesis, fit)))
+        likeliest = [score.effect for gain, score in sorted(gains, key=lambda p: -p[0])[:MIN_RESTARTS] if gain > MIN_SCORE_GAIN]
         pairs = [self._begun_afresh(Hypothesis((*hypothesis.effects, effect), hypothesis.ageing)) for effect in likeliest]
-        likelier = [p for p in pairs if p and p.found.expected > fit.log_likelihood + WORTH]
+        likelier = [p for p in pairs if p and p.found.expected > fit.log_likelihood + MIN_SCORE_GAIN]
         return max(likelier, key=lambda p: p.found.point.log_likelihood, default=None)
 
-    def _carry_on(self, trial: _Trial, highest: float) -> float:
+    def _finish_from_start_values(self, trial: _Trial, highest: float) -> float:
         """Fit a model begun from the start values of the file where enough is expected of it, and first what it lacks.
 
         With coloured noise as that of the baseline, too. What is far behind the highest log likelihood under white noise is left.
@@ -834,20 +863,20 @@ class ModelSearch:
         """
         hypothesis, beside, own, found = trial.hypothesis, trial.beside, trial.own, trial.found
         self._followed.add(hypothesis.name)
-        places = [near] if hypothesis.ageing and (near := self._near(hypothesis, beside)) else []
-        if found.away > 1.0 and found.point.log_likelihood > highest - HOPELESS:
+        places = [near] if hypothesis.ageing and (near := self._maximum_near_parents(hypothesis, beside)) else []
+        if found.away > 1.0 and found.point.log_likelihood > highest - PRUNING_DEFICIT:
             found = maximise(own, found.point.x, close=1.0, progress=self.progress)
         if found.point.log_likelihood > highest and (pair := self._with_a_second(replace(trial, found=found))):
-            highest = self._carry_on(pair, highest)
+            highest = self._finish_from_start_values(pair, highest)
         highest = max(highest, found.point.log_likelihood)
         places.append((own, found))
-        if beside.processes and found.point.log_likelihood > highest - HOPELESS:
+        if beside.processes and found.point.log_likelihood > highest - PRUNING_DEFICIT:
             noise = {n: v for n, v in self.baseline.fit.values.items() if n.startswith("gauge_")}
             x = beside.coordinates({**found.point.values, **noise})
             places.append((beside, maximise(beside, x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)))
         if move := self._move_from(hypothesis, *max(places, key=lambda p: p[1].point.log_likelihood)):
             best = self.best()
-            if -move.expected > best.evidence - (CLOSE if best.passes else HOPELESS):
+            if -move.expected > best.evidence - (LOG_BAYES_MARGIN if best.passes else PRUNING_DEFICIT):
                 self._fit_next(move)
             else:
                 self._push([move])
@@ -867,7 +896,7 @@ class ModelSearch:
         best model has an effect, or another law than the stated one, each is scored to its maximum: the right one lies far off.
         """
         whole = bool(best.hypothesis.reported)
-        reached = [(law[0], *near) for law in self._other_laws(best) if (near := self._near(*law, whole))]
+        reached = [(law[0], *near) for law in self._other_laws(best) if (near := self._maximum_near_parents(*law, whole))]
         for number, (hypothesis, likelihood, found) in enumerate(sorted(reached, key=lambda r: -r[2].expected)):
             if number == 0 and found.away > 1.0:
                 found = maximise(likelihood, found.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
@@ -880,29 +909,31 @@ class ModelSearch:
         own = ((h, self._likelihood(h, self.baseline, name)) for name, h in others if h != best.hypothesis)
         return [(hypothesis, likelihood) for hypothesis, likelihood in own if likelihood is not None]
 
-    def _near(self, hypothesis: Hypothesis, likelihood: Likelihood, whole: bool = False) -> tuple[Likelihood, Maximum] | None:
+    def _maximum_near_parents(
+        self, hypothesis: Hypothesis, likelihood: Likelihood, whole: bool = False
+    ) -> tuple[Likelihood, Maximum] | None:
         """Return where scoring takes a law from where the baseline or the best stands, by a few steps or the whole way.
 
         None if it was begun there already.
         """
         parents = {f.name: f for f in (self.baseline, self.best())}.values()
-        starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in parents]
+        starts = [likelihood.coordinates(_with_wide_field(f.fit.values, likelihood.problem)) for f in parents]
         heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts] if len(starts) > 1 else [0.0]
         x = starts[int(np.argmax(heights))]
         how_far, tried = self._tried.get(hypothesis.name, (False, ()))
         if how_far >= whole and np.array_equal(x, tried):
             return None
         self._tried[hypothesis.name] = whole, x
-        how: dict[str, Any] = {} if whole else {"steps": NEAR_STEPS, "widths": ()}
+        how: dict[str, Any] = {} if whole else {"steps": SCREENING_STEPS, "widths": ()}
         return likelihood, maximise(likelihood, x, close=1.0, progress=self.progress, **how)
 
     def _move_from(self, hypothesis: Hypothesis, likelihood: Likelihood, found: Maximum) -> _Move | None:
         """Return a model of one part more, or another law, that goes on from there; None where too little is expected of it."""
         node = self.baseline
-        if not found.expected > node.fit.log_likelihood + (WORTH if node.passes else -HOPELESS):
+        if not found.expected > node.fit.log_likelihood + (MIN_SCORE_GAIN if node.passes else -PRUNING_DEFICIT):
             return None
         self.count += 1
-        expected = found.expected - node.fit.log_likelihood + node.attainable + len(hypothesis.effects) * self._one_more
+        expected = found.expected - node.fit.log_likelihood + node.attainable + len(hypothesis.effects) * self._effect_log_penalty
         noise_anew = node.fit.likelihood.processes and not likelihood.processes
         values = {n: v for n, v in found.point.values.items() if not (noise_anew and n.startswith("gauge_"))}
         return _Move(-expected, self.count, hypothesis, values, _sizes_of(hypothesis, likelihood.problem.model, values))
@@ -915,15 +946,15 @@ class ModelSearch:
         problem, processes = best.fit.likelihood.problem, best.fit.likelihood.processes
         if not best.hypothesis.reported or not problem.runs:
             return
-        rough = Likelihood(problem, processes=processes, rtol=SEARCH_RTOL)
-        begun = rough.at(rough.coordinates(best.fit.values))
-        found = scan_narrow(rough, begun, self.progress) or replace(best.fit.maximum, point=begun)
+        likelihood = Likelihood(problem, processes=processes, rtol=SEARCH_RTOL)
+        begun = likelihood.at(likelihood.coordinates(best.fit.values))
+        found = scan_narrow(likelihood, begun, self.progress) or replace(best.fit.maximum, point=begun)
         for effect in (e for e in best.hypothesis.effects if e.settings):
-            sizes = [n for n in (*own_parameters(effect, problem.model), *effect.frees) if n in rough.names]
-            found = self._at_another_size(rough, found, sizes[0]) if sizes else found
+            sizes = [n for n in (*own_parameters(effect, problem.model), *effect.frees) if n in likelihood.names]
+            found = self._at_another_size(likelihood, found, sizes[0]) if sizes else found
         if found.point is not begun:
-            fit = self._state_space(problem, part=StateSpaceFit(rough, found), processes=processes)
-            self._record(self._judged(best.hypothesis, fit))
+            fit = self._state_space(problem, part=StateSpaceFit(likelihood, found), processes=processes)
+            self._record(self._assessed(best.hypothesis, fit))
 
     def _at_another_size(self, likelihood: Likelihood, found: Maximum, size: str) -> Maximum:
         """Return the maximum that halving or doubling a size leads to, again and again, as long as each is likelier."""
@@ -934,7 +965,7 @@ class ModelSearch:
             if x[place] == found.point.x[place]:  # it stands at its bound
                 continue
             other = maximise(likelihood, x, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
-            if other.point.log_likelihood > found.point.log_likelihood + NEEDED:
+            if other.point.log_likelihood > found.point.log_likelihood + SIGNIFICANT_GAIN:
                 return self._at_another_size(likelihood, other, size)
         return found
 
@@ -951,7 +982,7 @@ class ModelSearch:
         """
         effects, ageing = best.hypothesis.effects, best.hypothesis.ageing
         for i, effect in enumerate(effects if len(self.experiment.runs) > 1 else ()):
-            if effect.run or not may_befall_one_run(effect):
+            if effect.run or not can_act_in_one_run(effect):
                 continue
             heights = []
             for run in best.fit.likelihood.problem.runs:
@@ -959,7 +990,7 @@ class ModelSearch:
                 own = best.fit.likelihood.beside(self._problem(one, best.fit.values))
                 heights.append((own.at(own.coordinates(best.fit.values), slopes=False).log_likelihood, run.name, one))
             likeliest, _, one = max(heights, key=lambda h: h[0])
-            if likeliest > best.fit.log_likelihood - WORTH and one.name not in self.fitted:
+            if likeliest > best.fit.log_likelihood - MIN_SCORE_GAIN and one.name not in self.fitted:
                 self._fit_from(best, one, self._sizes(best))
 
     def _fit_from(self, node: Fitted, hypothesis: Hypothesis, sizes: tuple[dict[str, float], ...]) -> None:
@@ -983,14 +1014,14 @@ class ModelSearch:
             asked.add(node.name)
             best = self.best()
             effects, ageing, sizes = node.hypothesis.effects, node.hypothesis.ageing, self._sizes(node)
-            if node.evidence < best.evidence - CLOSE:
+            if node.evidence < best.evidence - LOG_BAYES_MARGIN:
                 break
             parts = [(Hypothesis(effects), sizes)] if ageing else []
             for i in range(len(effects)):
                 parts.append((Hypothesis(effects[:i] + effects[i + 1 :], ageing), sizes[:i] + sizes[i + 1 :]))
             for part, own in parts:
                 known = self.fitted.get(part.name)
-                if known is not None and known.passes and known.evidence > best.evidence - CLOSE:
+                if known is not None and known.passes and known.evidence > best.evidence - LOG_BAYES_MARGIN:
                     continue
                 if not part.reported and node is not best:
                     continue
@@ -1006,20 +1037,22 @@ class ModelSearch:
     def _record(self, found: Fitted) -> Fitted:
         name = found.name
         known = self.fitted.get(name)
-        text = f"log evidence {found.separate:.1f}" + (f", but {found.against[0]}" if found.against else "")
+        text = f"log evidence {found.separate_field_evidence:.1f}" + (f", but {found.against[0]}" if found.against else "")
         self.progress(f"{name}: {text}")
-        if known is None or found.separate > known.separate:
-            same = known is not None and found.separate - known.separate < NEEDED
+        if known is None or found.separate_field_evidence > known.separate_field_evidence:
+            same = known is not None and found.separate_field_evidence - known.separate_field_evidence < SIGNIFICANT_GAIN
             self.fitted[name] = replace(found, scores=known.scores) if known is not None and same else found
-            self._grant_shared_field()
+            self._credit_shared_field()
         return self.fitted[name]
 
-    def _grant_shared_field(self) -> None:
+    def _credit_shared_field(self) -> None:
         """Grant all models what the likeliest gains by a field that all runs share: first-order gains do not decide."""
         under = {f.name: f for f in self.fitted.values() if f.shared is not None}
         if under:
-            gain = max(under.values(), key=lambda f: f.separate).shared or 0.0
-            self.fitted.update({name: replace(f, granted=gain) for name, f in under.items() if f.granted != gain})
+            gain = max(under.values(), key=lambda f: f.separate_field_evidence).shared or 0.0
+            self.fitted.update(
+                {name: replace(f, shared_field_gain=gain) for name, f in under.items() if f.shared_field_gain != gain}
+            )
 
     def ranked(self) -> list[Fitted]:
         """Return everything that was fitted, best evidence first."""
@@ -1044,18 +1077,18 @@ def _sizes_of(hypothesis: Hypothesis, model: GeneratedModel, values: Mapping[str
     )
 
 
-def _colours(values: Mapping[str, float]) -> list[str] | None:
+def _colour_processes(values: Mapping[str, float]) -> list[str] | None:
     """Return the processes of coloured gauge noise of the model that was fitted with these values; None if they have no noise."""
     names = {name.partition("[")[0] for name in values}
     return processes_in(names) if "gauge_white" in names else None
 
 
-def _followable(values: Mapping[str, float], problem: Problem) -> dict[str, float]:
+def _with_wide_field(values: Mapping[str, float], problem: Problem) -> dict[str, float]:
     """Return start values under a field wide enough for the filter to stay with the recordings."""
     own = Likelihood(problem)
     start = own.values(own.start)
     found = dict(values)
     if not found.get("field_amplitude"):
         found["field_length"] = start["field_length"]
-    found["field_amplitude"] = max(found.get("field_amplitude", 0.0), FOLLOWED * start["field_amplitude"])
+    found["field_amplitude"] = max(found.get("field_amplitude", 0.0), MIN_START_FIELD * start["field_amplitude"])
     return found

@@ -18,25 +18,31 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.groups import GAUGE_NOISE
 from srfcli.data.values import BETWEEN_SAMPLES, Experiment, told_of_runs
-from srfcli.diagnosis.goodness_of_fit import improbability, loudness, over_noise, shortcomings, uneven_noise
+from srfcli.diagnosis.goodness_of_fit import (
+    failed_tests,
+    gauge_noise_tests,
+    noise_ratio_over_limit,
+    relative_surprisal,
+    uneven_noise,
+)
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, typical_sizes
-from srfcli.diagnosis.scores import Remainder, Score, own_values
-from srfcli.diagnosis.search import CLOSE, NEAR, SEARCH_RTOL, WORTH, Fitted, ModelSearch
+from srfcli.diagnosis.scores import ResidualProjection, Score, run_specific_values
+from srfcli.diagnosis.search import LOG_BAYES_MARGIN, MIN_SCORE_GAIN, SEARCH_RTOL, SEARCH_TOLERANCE, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.state_space import NEEDED, Filtered, StateSpaceFit, fit_state_space, log_evidence, maximise
+from srfcli.inference.state_space import SIGNIFICANT_GAIN, Filtered, StateSpaceFit, fit_state_space, log_evidence, maximise
 
 ABSORBED_SHARE = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
-ALIKE = 0.97  # likeness of two effects' projected columns beyond which they are one class
-BEHIND = 50.0  # in log evidence, by how much a model may be behind and still be asked what it predicts
-LACKING = 40.0  # in log evidence, what a model that fails a test loses in the stated confidence
-# by what log evidence is divided in the stated confidence: likeliest in 224 sealed cases (1.3 to 2.5; benchmarks/calibration.py)
-TEMPER = 1.83
-# the likeliest shares of the last 109 sealed cases (benchmarks/calibration.py): of something else being concealed where a model
-# passed, of what is concealed being registered, or nothing, where the verdict is unknown
-UNEXPLAINED, MISSED = 0.09, 0.65
-UNKNOWN, ALONE = "unknown", "in one run"  # when a remark is told: under these verdicts, or where an effect acts in one run
-MISSING = ("identified", "ambiguous", UNKNOWN)
-ALWAYS = ("none", "inconclusive", *MISSING)
+EQUIVALENT_CORRELATION = 0.97  # likeness of two effects' projected columns beyond which they are one class
+VALIDATION_DEFICIT = 50.0  # in log evidence, by how much a model may be behind and still be asked what it predicts
+FAILED_TEST_PENALTY = 40.0  # in log evidence, what a model that fails a test loses in the stated confidence
+# by what log evidence is divided in the stated confidence, so that confidences are frequencies (benchmarks/calibration.py)
+CALIBRATION_TEMPERATURE = 1.83
+# maximum-likelihood probabilities (benchmarks/calibration.py): that something else is missing although a model passed, and that
+# what is missing is registered, or nothing is missing, where the verdict is unknown
+PROB_UNREGISTERED_IF_PASSED, PROB_REGISTERED_IF_UNKNOWN = 0.09, 0.65
+UNKNOWN, IN_ONE_RUN = "unknown", "in one run"  # when a remark is told: under these verdicts, or where an effect acts in one run
+BASELINE_REJECTED = ("identified", "ambiguous", UNKNOWN)
+ALL_VERDICTS = ("none", "inconclusive", *BASELINE_REJECTED)
 
 
 @dataclass(frozen=True)
@@ -59,11 +65,11 @@ class Model:
         return self.hypothesis.name
 
 
-M = TypeVar("M", Model, Fitted)
+ModelT = TypeVar("ModelT", Model, Fitted)
 
 
 @dataclass(frozen=True)
-class Predicted:
+class PredictiveScore:
     """How the best model predicts what is held out: its gain in log likelihood over the baseline, the rms of `size` residuals.
 
     `followed` and `loud` are of a run: the latter says whether the model needs more gauge noise than it shows, where no run that
@@ -99,54 +105,54 @@ class Conclusion:
 
 
 @dataclass(frozen=True)
-class Held:
+class HeldOutRun:
     """One held-out run filtered under the baseline and under the best model, both as they were fitted to the other runs.
 
-    `shown` is that of the baseline with the best model's field and gauge noise; `models` are the two.
+    `reported_baseline` is that of the baseline with the best model's field and gauge noise; `models` are the two.
     """
 
     baseline: Filtered
     augmented: Filtered
-    shown: Filtered
+    reported_baseline: Filtered
     models: tuple[Fitted, Fitted] = field(repr=False)
 
     @property
-    def predicted(self) -> Predicted:
+    def predicted(self) -> PredictiveScore:
         """Return how the best model predicts it, with parameters as uncertain as its fit leaves them."""
         run, white = self.baseline.run, self.augmented.white
         before, after = (f.predictive(run) for f in self.models)
         own, loud = after.fit, ""
-        if self.models[1].fit.likelihood.noisy_alone(run):
-            loud = next((text for size, text in loudness(own.likelihood, own.maximum.point) if size > 1.0), "")
+        if self.models[1].fit.likelihood.has_own_noise(run):
+            loud = next((text for size, text in gauge_noise_tests(own.likelihood, own.maximum.point) if size > 1.0), "")
         gain = after.log_likelihood - before.log_likelihood
-        return Predicted(run.name, gain, after.rms, white.size, self.augmented.whole, loud)
+        return PredictiveScore(run.name, gain, after.rms, white.size, self.augmented.whole, loud)
 
 
 @dataclass(frozen=True)
-class HeldLoads:
+class HeldOutLoads:
     """One held-out table of critical loads beside the baseline's and the best model's, as they were fitted to the rest."""
 
     baseline: Matched
     augmented: Matched
-    predicted: Predicted
+    predicted: PredictiveScore
 
 
 @dataclass(frozen=True)
 class Diagnosis(Conclusion):
     """Everything that is said and what it rests on; `close` are the models that may be it, `best` the one that is reported.
 
-    `shown` is the baseline with the best model's field and gauge noise, its own parameters fitted again.
+    `reported_baseline` is the baseline with the best model's field and gauge noise, its own parameters fitted again.
     """
 
     experiment: Experiment
     best: Fitted
     baseline: Fitted
-    shown: Fitted
+    reported_baseline: Fitted
     ranked: tuple[Fitted, ...]
     close: tuple[Fitted, ...]
     scores: tuple[Score, ...]
-    held: tuple[Held, ...] = field(repr=False)
-    held_loads: tuple[HeldLoads, ...] = field(repr=False)
+    held: tuple[HeldOutRun, ...] = field(repr=False)
+    held_loads: tuple[HeldOutLoads, ...] = field(repr=False)
 
     @property
     def acts_in(self) -> dict[str, str]:
@@ -160,60 +166,68 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     own_noise = GAUGE_NOISE in set(search.whole.vary) - set(whole.vary)
     whole = replace(whole, vary=search.whole.vary) if own_noise else whole
     baseline, ranked = search.baseline, tuple(search.ranked())
-    told = held_out_likelihoods(asked(ranked), whole)
+    told = held_out_likelihoods(models_for_validation(ranked), whole)
     models = [
         Model(f.hypothesis, f.evidence, f.against, told.get(f.name, 0.0), tuple(r.white for r in f.fit.maximum.point.runs),
               len(f.fit.likelihood.problem.model.parameters))
         for f in ranked
     ]  # fmt: skip
-    close = tuple(f for m in may_be_it(models)[0] for f in ranked if f.name == m.name)
+    close = tuple(f for m in competing_models(models)[0] for f in ranked if f.name == m.name)
     best = close[0] if close else ranked[0]
-    shown = on_the_track_of(best, baseline) if best.passes else baseline
-    held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
+    reported_baseline = baseline_with_noise_of(best, baseline) if best.passes else baseline
+    held, held_loads = held_out(baseline, best, whole, reported_baseline), held_out_loads(baseline, best, whole)
     wrong = [] if best.passes else [*uneven_noise(best.fit), *unsteady_start(search, best)]
-    remarks = [*((text, (UNKNOWN,)) for text in wrong), *not_the_same(baseline)]
-    remarks += [(text, MISSING) for text in told_of_runs(search.whole.runs, BETWEEN_SAMPLES)]
+    remarks = [*((text, (UNKNOWN,)) for text in wrong), *parameter_differing_in_one_run(baseline)]
+    remarks += [(text, BASELINE_REJECTED) for text in told_of_runs(search.whole.runs, BETWEEN_SAMPLES)]
     if search.on_request:
         names = ", ".join(search.on_request)
         remarks.append(
-            (f"not tried, as they are on request only: {names}; --effect NAME tries those named and no others", (UNKNOWN, ALONE))
+            (
+                f"not tried, as they are on request only: {names}; --effect NAME tries those named and no others",
+                (UNKNOWN, IN_ONE_RUN),
+            )
         )
     if whole.runs and not baseline.fit.likelihood.problem.runs:
-        remarks.append(("held-out runs are not judged, as no run was fitted that would tell the gauge's noise", ALWAYS))
+        remarks.append(("held-out runs are not judged, as no run was fitted that would tell the gauge's noise", ALL_VERDICTS))
     if own_noise:
         said = f"each {whole.vary[GAUGE_NOISE]} was given a gauge noise of its own, as no one noise is that of all"
-        remarks.append((said, ALWAYS))
+        remarks.append((said, ALL_VERDICTS))
     for fitted in close or (best,):
         for name in at_bounds(fitted):
             there = "" if name in (q.name for q in whole.parameters) else " of the augmented experiment"
-            remarks.append((f"{name} of {fitted.name} stands at its bound; [parameters]{there} can widen it", ALWAYS))
+            remarks.append((f"{name} of {fitted.name} stands at its bound; [parameters]{there} can widen it", ALL_VERDICTS))
     judged = judge(
         models, baseline.singles, [h.predicted for h in held if best.passes], [h.predicted for h in held_loads],
         search.excluded, remarks, search.budget if search.cut_short else None,
     )  # fmt: skip
     return Diagnosis(
-        **vars(judged), experiment=whole, best=best, baseline=baseline, shown=shown, ranked=ranked, close=close,
-        scores=tuple(baseline.singles), held=held, held_loads=held_loads,
+        **vars(judged), experiment=whole, best=best, baseline=baseline, reported_baseline=reported_baseline, ranked=ranked,
+        close=close, scores=tuple(baseline.singles), held=held, held_loads=held_loads,
     )  # fmt: skip
 
 
 def judge(
-    ranked: Sequence[Model], scores: Sequence[Score] = (), held: Sequence[Predicted] = (), loads: Sequence[Predicted] = (),
-    excluded: Sequence[Excluded] = (), remarks: Sequence[tuple[str, Sequence[str]]] = (), ended: float | None = None,
-) -> Conclusion:  # fmt: skip
+    ranked: Sequence[Model],
+    scores: Sequence[Score] = (),
+    held: Sequence[PredictiveScore] = (),
+    loads: Sequence[PredictiveScore] = (),
+    excluded: Sequence[Excluded] = (),
+    remarks: Sequence[tuple[str, Sequence[str]]] = (),
+    ended: float | None = None,
+) -> Conclusion:
     """Return what follows from models, best evidence first, scores of the baseline, and how what is held out is predicted.
 
-    `remarks` are sentences, each with the verdicts under which it is told, or ALONE, where what is identified acts in one run.
-    `ended` is the budget, in s of CPU, of a search that left models to fit.
+    `remarks` are sentences, each with the verdicts under which it is told, or IN_ONE_RUN, where what is identified acts in one
+    run. `ended` is the budget, in s of CPU, of a search that left models to fit.
     """
-    close, joint, became = may_be_it(ranked)
+    close, joint, became = competing_models(ranked)
     best = close[0] if close else ranked[0]
-    ungated, reasons = _said(best, close, scores, ended is not None)
-    refused = refusal(held, loads) if ungated != "unknown" else ""
+    ungated, reasons = _verdict_and_reasons(best, close, scores, ended is not None)
+    refused = holdout_rejection(held, loads) if ungated != "unknown" else ""
     verdict = "unknown" if refused else ungated
     alone = verdict == "identified" and any(e.run for e in best.hypothesis.effects)
     reasons += [refused] if refused else []
-    reasons += [text for text, under in remarks if verdict in under or (alone and ALONE in under)]
+    reasons += [text for text, under in remarks if verdict in under or (alone and IN_ONE_RUN in under)]
     if ended is not None:
         reasons.append(f"the search ended at its budget of {ended:.0f} s of CPU, with models left to fit")
     named = tuple(dict.fromkeys(n for m in close for n in m.hypothesis.reported))
@@ -221,7 +235,8 @@ def judge(
     absorbed = [
         Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.tolerance):.2f} % of it")
         for s in scores
-        if s.tolerance < ABSORBED_SHARE and s.detectable > interesting(s) and s.effect.reported not in named  # found all the same
+        # found all the same
+        if s.tolerance < ABSORBED_SHARE and s.detectable > relevant_effect_size(s) and s.effect.reported not in named
     ]
     return Conclusion(
         verdict, ungated, {"identified": best.hypothesis.reported, "ambiguous": named}.get(verdict, ()),
@@ -239,52 +254,54 @@ def unsteady_start(search: ModelSearch, best: Fitted) -> list[str]:
     problem = Hypothesis().problem(search.registry, replace(experiment, runs=runs), trend=search.trend)
     found = None
     with contextlib.suppress(SrfError), search.within_budget():
-        found = fit_state_space(problem, cautious=True, beside=False, close=NEAR, rtol=SEARCH_RTOL, progress=search.progress)
+        found = fit_state_space(
+            problem, cautious=True, beside=False, close=SEARCH_TOLERANCE, rtol=SEARCH_RTOL, progress=search.progress
+        )
     if found is None:
         return []
-    gain = log_evidence(found) - best.separate
-    then = "" if shortcomings(found) else ", and every test is passed"
+    gain = log_evidence(found) - best.separate_field_evidence
+    then = "" if failed_tests(found) else ", and every test is passed"
     said = f'the baseline with initial = "free", the state at the first sample estimated, gains {gain:.0f} in log evidence{then}'
-    return [said] if gain > CLOSE else []
+    return [said] if gain > LOG_BAYES_MARGIN else []
 
 
-def not_the_same(baseline: Fitted) -> list[tuple[str, Sequence[str]]]:
+def parameter_differing_in_one_run(baseline: Fitted) -> list[tuple[str, Sequence[str]]]:
     """Return which parameter of the baseline differs in one run, and where it is told.
 
     Where an effect was found, that is only if it gains more, at first order, than any effect.
     """
-    own = next(iter(own_values(baseline.remainder)), None)
-    if own is None or own.gain < WORTH:
+    own = next(iter(run_specific_values(baseline.projection)), None)
+    if own is None or own.gain < MIN_SCORE_GAIN:
         return []
-    gains = [s.gain for s in (*baseline.singles, *(baseline.scores.alone if baseline.scores else ()))]
+    gains = [s.gain for s in (*baseline.singles, *(baseline.scores.single_run if baseline.scores else ()))]
     value, unit = baseline.fit.values[own.parameter], baseline.fit.likelihood.problem.unit_of(own.parameter)
     there, here = (f"{from_base(x, unit):.3g}{'' if unit == '1' else ' ' + unit}" for x in (value + own.change, value))
     said = f"{own.parameter} of {own.run} alone, about {there} where the baseline has {here}"
     said = f"{said}, would gain {own.gain:.0f} in log likelihood: --vary {own.parameter}"
-    return [(said, (UNKNOWN,) if own.gain < max(gains, default=0.0) else (UNKNOWN, ALONE))]
+    return [(said, (UNKNOWN,) if own.gain < max(gains, default=0.0) else (UNKNOWN, IN_ONE_RUN))]
 
 
-def asked(ranked: Sequence[M]) -> list[M]:
+def models_for_validation(ranked: Sequence[ModelT]) -> list[ModelT]:
     """Return the models that are asked what they say of what is held out: those that pass and are not far behind."""
-    least = ranked[0].evidence - (CLOSE if ranked[0].against else BEHIND)
+    least = ranked[0].evidence - (LOG_BAYES_MARGIN if ranked[0].against else VALIDATION_DEFICIT)
     return [m for m in ranked if not m.against and m.evidence > least]
 
 
-def may_be_it(ranked: Sequence[Model]) -> tuple[tuple[Model, ...], dict[str, float], dict[str, str]]:
+def competing_models(ranked: Sequence[Model]) -> tuple[tuple[Model, ...], dict[str, float], dict[str, str]]:
     """Return the models that pass and may be it, best first, and the log evidence of each model on all runs together.
 
     That is its evidence on the runs fitted and its likelihood of the runs held out, for those that pass; the others are given
     the same likelihood as the best of these. Of two that come close one that holds the other gives way, and one that
     became the other; of an effect in all runs or in one, that which is worse. The third is which became which, by name.
     """
-    passed = asked(ranked)
+    passed = models_for_validation(ranked)
     told = {m.name: m.held_out for m in passed}
     if not any(np.isfinite(t) for t in told.values()):  # no model follows what is held out
         told = {}
     passed.sort(key=lambda m: -m.evidence - told.get(m.name, 0.0))
     rest = told.get(passed[0].name, 0.0) if passed else 0.0
     joint = {m.name: m.evidence + told.get(m.name, rest) for m in ranked}
-    close = [m for m in passed if joint[passed[0].name] - joint[m.name] < CLOSE]
+    close = [m for m in passed if joint[passed[0].name] - joint[m.name] < LOG_BAYES_MARGIN]
     names = [set(m.hypothesis.reported) for m in close]
     close = [m for m, own in zip(close, names, strict=True) if not any(n < own for n in names)]
     best: dict[frozenset[str], Model] = {}
@@ -292,7 +309,7 @@ def may_be_it(ranked: Sequence[Model]) -> tuple[tuple[Model, ...], dict[str, flo
         best.setdefault(frozenset(m.hypothesis.reported), m)
     became = {}
     for m in close:
-        laws = [other for other in close if _is_that_law(m, other, joint)]
+        laws = [other for other in close if _reduces_to_law(m, other, joint)]
         if laws:
             became[m.name] = min(laws, key=lambda law: law.parameters).name
     return tuple(m for m in best.values() if m.name not in became), joint, became
@@ -307,7 +324,7 @@ def held_out_likelihoods(fits: Sequence[Fitted], whole: Experiment) -> dict[str,
         told[f.name] += sum(own.held_out_table(t, f.fit.values).log_likelihood for t in whole.thresholds if t.holdout)
     under = [f for f in fits if f.shared is not None]
     if 0 < len(under) < len(fits):  # what is a function of slip tells a held-out run on the same track, as a field there would
-        gain = shared_gain(max(under, key=lambda f: f.separate), whole)
+        gain = shared_gain(max(under, key=lambda f: f.separate_field_evidence), whole)
         told |= {f.name: told[f.name] + gain for f in under}
     return told
 
@@ -319,11 +336,11 @@ def shared_gain(fitted: Fitted, whole: Experiment) -> float:
         if np.isfinite(fit.log_likelihood):
             every = replace(fit, maximum=replace(fit.maximum, point=fit.likelihood.at(fit.maximum.point.x)))
             fit.likelihood.best = None  # derivatives of all readings take much room
-            total += max(Remainder(every).shared.gain - NEEDED - (fitted.shared or 0.0), 0.0)
+            total += max(ResidualProjection(every).shared.gain - SIGNIFICANT_GAIN - (fitted.shared or 0.0), 0.0)
     return total
 
 
-def _is_that_law(model: Model, other: Model, evidence: Mapping[str, float]) -> bool:
+def _reduces_to_law(model: Model, other: Model, evidence: Mapping[str, float]) -> bool:
     """Return whether a model became what another ageing law is that has fewer parameters: the innovations are the same.
 
     Either without effects or beside the same ones.
@@ -331,13 +348,13 @@ def _is_that_law(model: Model, other: Model, evidence: Mapping[str, float]) -> b
     beside = other.hypothesis.reported[1:]
     if not other.hypothesis.ageing or other is model or (beside and beside != model.hypothesis.reported[1:]):
         return False
-    if model.parameters <= other.parameters or evidence[model.name] - evidence[other.name] > NEEDED:
+    if model.parameters <= other.parameters or evidence[model.name] - evidence[other.name] > SIGNIFICANT_GAIN:
         return False
     whites = zip(model.innovations, other.innovations, strict=True)
-    return float(sum(np.sum((a - b) ** 2) for a, b in whites)) < 2 * CLOSE
+    return float(sum(np.sum((a - b) ** 2) for a, b in whites)) < 2 * LOG_BAYES_MARGIN
 
 
-def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
+def baseline_with_noise_of(best: Fitted, baseline: Fitted) -> Fitted:
     """Return the baseline with field and gauge noise of a better model, its own parameters fitted again from those of that one.
 
     By itself it widens the field until that takes up what is missing, and nothing is left to be seen.
@@ -346,24 +363,26 @@ def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
         return baseline
     problem = baseline.fit.likelihood.problem
     likelihood = best.fit.likelihood.beside(problem)
-    held = [n for n in likelihood.names if n not in problem.names]
-    found = maximise(likelihood, likelihood.coordinates(best.fit.values), held=held, close=NEAR)
+    fixed = [n for n in likelihood.names if n not in problem.names]
+    found = maximise(likelihood, likelihood.coordinates(best.fit.values), fixed=fixed, close=SEARCH_TOLERANCE)
     if found.status is Status.INTEGRATION:
         return baseline
     return replace(baseline, fit=StateSpaceFit(likelihood, found))
 
 
-def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | None = None) -> tuple[Held, ...]:
+def held_out(
+    baseline: Fitted, best: Fitted, whole: Experiment, reported_baseline: Fitted | None = None
+) -> tuple[HeldOutRun, ...]:
     """Return every held-out run under two fitted models, and under the baseline as it is shown, if that is another."""
     if not baseline.fit.likelihood.problem.runs:
         return ()  # of a gauge that nothing was fitted to
-    models = (baseline, best, shown or baseline)
+    models = (baseline, best, reported_baseline or baseline)
     runs = (run for run in whole.runs if run.holdout)
     sides = ([f.fit.likelihood.held_out(run, f.fit.values) for f in models] for run in runs)
-    return tuple(Held(first, last, seen, (baseline, best)) for first, last, seen in sides)
+    return tuple(HeldOutRun(first, last, seen, (baseline, best)) for first, last, seen in sides)
 
 
-def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[HeldLoads, ...]:
+def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[HeldOutLoads, ...]:
     """Return every held-out table of critical loads under two fitted models."""
     found = []
     for loads in (t for t in whole.thresholds if t.holdout):
@@ -371,19 +390,19 @@ def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[H
         spread = np.eye(after.white.size) + after.slopes @ best.fit.covariance @ after.slopes.T
         cost = float(after.white @ np.linalg.solve(spread, after.white))
         gain, size = after.log_likelihood - before.log_likelihood, after.white.size
-        rms, excess = float(np.sqrt(after.match.cost / size)), improbability(cost, size)
-        found.append(HeldLoads(before, after, Predicted(loads.name, gain, rms, size, excess=excess)))
+        rms, excess = float(np.sqrt(after.match.cost / size)), relative_surprisal(cost, size)
+        found.append(HeldOutLoads(before, after, PredictiveScore(loads.name, gain, rms, size, excess=excess)))
     return tuple(found)
 
 
-def _said(best: Model, close: Sequence[Model], scores: Sequence[Score], cut_short: bool) -> tuple[str, list[str]]:
+def _verdict_and_reasons(best: Model, close: Sequence[Model], scores: Sequence[Score], cut_short: bool) -> tuple[str, list[str]]:
     if best.against:
         return "unknown", [f"{best.name}: {reason}" for reason in best.against]
     reasons = [f"{best.name if best.hypothesis.reported else 'the baseline'} passes every test"]
     if not best.hypothesis.reported:
         if cut_short:
             return "inconclusive", [*reasons, "models that may explain more were not fitted"]
-        seen = [s for s in scores if s.detectable < interesting(s)]
+        seen = [s for s in scores if s.detectable < relevant_effect_size(s)]
         if 2 * len(seen) >= len(scores):
             return "none", [*reasons, "the baseline explains the recordings"]
         return "inconclusive", [*reasons, "nothing is needed, and most effects of interesting size could not have been seen"]
@@ -392,17 +411,17 @@ def _said(best: Model, close: Sequence[Model], scores: Sequence[Score], cut_shor
     return "identified", reasons
 
 
-def refusal(runs: Sequence[Predicted], loads: Sequence[Predicted] = ()) -> str:
+def holdout_rejection(runs: Sequence[PredictiveScore], loads: Sequence[PredictiveScore] = ()) -> str:
     """Return why held-out runs and critical loads refuse the best model; nothing where they do not.
 
-    Were a model true, another one would predict new data better by CLOSE in log likelihood in at most exp(-CLOSE) of cases, as
-    the ratio of their likelihoods is one on average.
+    Were a model true, another one would predict new data better by LOG_BAYES_MARGIN in log likelihood in exp(-LOG_BAYES_MARGIN)
+    of cases at most, as the ratio of their likelihoods is one on average.
     """
     for table in loads:
         if table.excess > 1.0:
             return f"held-out critical loads are not predicted: {table.name} has chi2 {table.size * table.rms**2:.1f}"
     more = sum(r.gain for r in runs) + sum(t.gain for t in loads)
-    if loads and more < -CLOSE:
+    if loads and more < -LOG_BAYES_MARGIN:
         return f"what is held out is predicted worse than by the baseline: log likelihood {more:+.1f}"
     if not runs:
         return ""
@@ -410,17 +429,17 @@ def refusal(runs: Sequence[Predicted], loads: Sequence[Predicted] = ()) -> str:
         return "held-out runs cannot be followed"
     if loud := next((f"what is left in {r.name} as noise, {r.loud}" for r in runs if r.loud), ""):
         return f"held-out runs are not predicted: with {loud}"
-    worst = max(runs, key=lambda r: over_noise(r.rms, r.size))
-    if not over_noise(worst.rms, worst.size) < 1.0:
+    worst = max(runs, key=lambda r: noise_ratio_over_limit(r.rms, r.size))
+    if not noise_ratio_over_limit(worst.rms, worst.size) < 1.0:
         said = f"innovations of {worst.name} have an rms of {worst.rms:.3f} with the parameters moved as they may"
         return f"held-out runs are not predicted: {said}"
     gain = sum(r.gain for r in runs)
-    if gain < -CLOSE:
+    if gain < -LOG_BAYES_MARGIN:
         return f"held-out runs are predicted worse than by the baseline: log likelihood {gain:+.1f}"
     return ""
 
 
-def interesting(score: Score) -> float:
+def relevant_effect_size(score: Score) -> float:
     """Return the size of an effect that matters, in um, s, N: what its plugin gives as default, from its neutral value."""
     if not score.effect.sizes:
         return float("inf") if "K" not in score.effect.frees else 0.1 * abs(score.values["K"])
@@ -444,12 +463,12 @@ def _equivalent(
 
     def apart(one: str, other: str) -> bool:
         sets = [set(m.hypothesis.reported) for m in close if one in m.hypothesis.reported]
-        return any(fitted[frozenset(s)] - fitted.get(frozenset(s - {one} | {other}), np.inf) > CLOSE for s in sets)
+        return any(fitted[frozenset(s)] - fitted.get(frozenset(s - {one} | {other}), np.inf) > LOG_BAYES_MARGIN for s in sets)
 
     found = []
     for a, b in combinations(scores, 2):
         one, other = a.effect.reported, b.effect.reported
-        alike = ({one, other} & names or not names) and abs(float(a.direction @ b.direction)) > ALIKE
+        alike = ({one, other} & names or not names) and abs(float(a.direction @ b.direction)) > EQUIVALENT_CORRELATION
         if alike and not (apart(one, other) or apart(other, one)):
             found.append((one, other))
     return tuple(found)
@@ -460,10 +479,10 @@ def _confidence(ranked: Sequence[Model], joint: Mapping[str, float], became: Map
 
     A model that became another law is that law.
     """
-    weights = {m.name: joint[m.name] - (LACKING if m.against else 0.0) for m in ranked}
+    weights = {m.name: joint[m.name] - (FAILED_TEST_PENALTY if m.against else 0.0) for m in ranked}
     top = max(weights.values())
-    share = {name: float(np.exp(max((w - top) / TEMPER, -60.0))) for name, w in weights.items()}
-    total, unknown = sum(share.values()), 1 - MISSED if verdict == "unknown" else UNEXPLAINED
+    share = {name: float(np.exp(max((w - top) / CALIBRATION_TEMPERATURE, -60.0))) for name, w in weights.items()}
+    total, unknown = sum(share.values()), 1 - PROB_REGISTERED_IF_UNKNOWN if verdict == "unknown" else PROB_UNREGISTERED_IF_PASSED
     for name, law in became.items():
         while law in became:  # each has fewer parameters than the one before
             law = became[law]

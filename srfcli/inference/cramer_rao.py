@@ -29,15 +29,15 @@ from srfcli.data.experiment import RunCheck
 from srfcli.data.gauge import COLOUR_SAMPLES, find_noise, of_one_gauge, whiten
 from srfcli.data.values import Experiment, ModelChoice
 from srfcli.inference.fit import solve_scaled
-from srfcli.inference.prediction import own_names, own_start, predict, run_parameters, stiffness_share
+from srfcli.inference.prediction import predict, run_parameters, run_specific_names, run_specific_start, stiffness_share
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, SampledLoad, runs_of
 
 MODIFIER = "linker-dieterich"
 SIZES = {"alpha": 0.2, "lambda": 0.1, "n": 0.1}  # that one would want to see: of rock's alpha, of lambda's own value, of n
-OTHER_MOTION = 3.0  # rms of simulation minus recording over the recording's own spread, from which it is another motion
-STIFFER = 1.5  # from half to twice the stated stiffness
-MOST_SIMULATED = 20_000  # samples of a run that are simulated
+MAX_MISFIT = 3.0  # rms of simulation minus recording over the recording's own spread, from which it is another motion
+STIFFNESS_RANGE = 1.5  # from half to twice the stated stiffness
+MAX_SIMULATED_SAMPLES = 20_000  # samples of a run that are simulated
 NOISE_BLOCK = 16  # samples of one: the first half tells what the noise is like there, the second half counts
 HELD = (2.0, 30.0)  # times its gauge's noise: standard deviation and range of a load that is only held
 CELL_DRIFT = 3e-4  # of the load: standard deviation of a load cell's own drift
@@ -68,7 +68,7 @@ class CramerRaoBound:
     @property
     def believed(self) -> bool:
         """Return whether the simulation resembles the recording enough to speak for it."""
-        return self.misfit <= OTHER_MOTION
+        return self.misfit <= MAX_MISFIT
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Forecast:
 
 
 @dataclass(frozen=True)
-class _Question:
+class _BoundProblem:
     """The experiment's model with alpha and n in it, values in um, s, N, and where in it is what.
 
     `asked` gives the model's parameter for a name of SIZES, `free` those unknown besides, `widths` their ranges.
@@ -90,7 +90,7 @@ class _Question:
     model: GeneratedModel
     experiment: Experiment
     values: Mapping[str, float]
-    asked: Mapping[str, str]
+    targets: Mapping[str, str]
     free: tuple[str, ...]
     widths: Mapping[str, float]
     trend: str | None
@@ -98,7 +98,7 @@ class _Question:
     @property
     def names(self) -> tuple[str, ...]:
         """Return all parameters by which derivatives are taken."""
-        return tuple(dict.fromkeys([*self.asked.values(), *self.free]))
+        return tuple(dict.fromkeys([*self.targets.values(), *self.free]))
 
 
 def forecast(
@@ -107,7 +107,7 @@ def forecast(
     *,
     registry: Registry,
     apparatus: bool = True,
-    most: int = MOST_SIMULATED,
+    most: int = MAX_SIMULATED_SAMPLES,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Forecast:
     """Return what these runs of an experiment could tell at best; raises SrfError where its model cannot be built.
@@ -115,7 +115,7 @@ def forecast(
     Stiffness and trends are unknown, too, unless `apparatus` is False: then it is a fit of the experiment's own free parameters.
     Of each run `most` samples are simulated, or fewer; of a longer one evenly chosen blocks stand for the others.
     """
-    question = _question(experiment, checks, registry, apparatus)
+    problem = _bound_problem(experiment, checks, registry, apparatus)
     runs, fitted = [], []
     for check in checks:
         progress(check.run.name)
@@ -124,19 +124,21 @@ def forecast(
         noises = of_one_gauge(dict(zip(check.run.sampling.spacings, check.noises, strict=True)), recorded)
         held = is_held(check)
         run = replace(check.run, load=ConstantLoad(check.load.mean)) if held else check.run
-        told = _simulated(question, replace(check, run=run, noises=noises), most)
-        errors, peaks = _errors(question, [told])
+        information = _simulated(problem, replace(check, run=run, noises=noises), most)
+        errors, peaks = _errors(problem, [information])
         name, holdout = check.run.name, check.run.holdout
-        one = CramerRaoBound(name, holdout, _variation([check]), errors, peaks, told.misfit, told.status, told.reached, held)
+        one = CramerRaoBound(
+            name, holdout, _variation([check]), errors, peaks, information.misfit, information.status, information.reached, held
+        )
         runs.append(one)
         if one.believed and not holdout:
-            fitted.append((check, told))
+            fitted.append((check, information))
     free = tuple(q.name for q in experiment.parameters if not q.fixed)
-    free += ("K",) if "K" in question.free and "K" not in free else ()
-    free += ("a trend of each run",) if question.trend else ()
+    free += ("K",) if "K" in problem.free and "K" not in free else ()
+    free += ("a trend of each run",) if problem.trend else ()
     if len(fitted) < 2:
         return Forecast(tuple(runs), None, free)
-    errors, peaks = _errors(question, [told for _, told in fitted])
+    errors, peaks = _errors(problem, [information for _, information in fitted])
     together = CramerRaoBound("all fitted runs", False, _variation([check for check, _ in fitted]), errors, peaks)
     return Forecast(tuple(runs), together, free)
 
@@ -167,7 +169,7 @@ def _variation(checks: Sequence[RunCheck]) -> float:
     return math.log(max(c.load.highest for c in checks) / min(c.load.lowest for c in checks))
 
 
-def _question(experiment: Experiment, checks: Sequence[RunCheck], registry: Registry, apparatus: bool) -> _Question:
+def _bound_problem(experiment: Experiment, checks: Sequence[RunCheck], registry: Registry, apparatus: bool) -> _BoundProblem:
     choice, listed = experiment.choice, {q.name: q for q in experiment.parameters}
     values, spelled = {}, {}
     if choice.interface == "elastic":  # W/lambda is kappa0 (W/Wref)^n at n = 1
@@ -189,9 +191,9 @@ def _question(experiment: Experiment, checks: Sequence[RunCheck], registry: Regi
     free = tuple(spelled.get(q.name, q.name) for q in listed.values() if not q.fixed)
     if apparatus and "K" not in free:
         share = stiffness_share(experiment, checks[0].run)
-        free, widths = (*free, "K"), {**widths, "K": STIFFER * checks[0].run.stiffness / share}
+        free, widths = (*free, "K"), {**widths, "K": STIFFNESS_RANGE * checks[0].run.stiffness / share}
     free = tuple(n for n in free if n in model.names)
-    return _Question(model, experiment, values, asked, free, widths, (experiment.trend or "slip") if apparatus else None)
+    return _BoundProblem(model, experiment, values, asked, free, widths, (experiment.trend or "slip") if apparatus else None)
 
 
 def _width(lower: float, upper: float, value: float) -> float:
@@ -209,7 +211,7 @@ def _with_memory(choice: ModelChoice, registry: Registry) -> GeneratedModel:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _RunInformation:
     """What a simulated run tells: Fisher information F (k, k), and the observable's derivatives Z (m, k) over the noise.
 
     A free initial state is unknown, too, and what it takes away is subtracted from both.
@@ -222,21 +224,21 @@ class _Told:
     reached: float
 
 
-def _simulated(question: _Question, check: RunCheck, most: int) -> _Told:
-    model, run = question.model, check.run
+def _simulated(problem: _BoundProblem, check: RunCheck, most: int) -> _RunInformation:
+    model, run = problem.model, check.run
     chosen, weight = _chosen(run.t.size, most)
     short = replace(run, t=run.t[chosen], observed=run.observed[chosen], used=run.used[chosen])
-    values, own = dict(question.values), own_names(model, short, question.trend)
-    p, ranges = run_parameters(model, question.experiment, short, values), []
+    values, own = dict(problem.values), run_specific_names(model, short, problem.trend)
+    p, ranges = run_parameters(model, problem.experiment, short, values), []
     for name in own:
-        values[name], low, high = own_start(model, short, p, name)
+        values[name], low, high = run_specific_start(model, short, p, name)
         ranges.append(_width(low, high, values[name]))
-    found = predict(model, question.experiment, short, values, by=(*question.names, *own), trend=question.trend)
+    found = predict(model, problem.experiment, short, values, by=(*problem.names, *own), trend=problem.trend)
     rate = run.sampling.at[chosen]
     seen = short.used & (short.t <= found.reached) & np.isfinite(found.J).all(axis=1)
     sigma = np.array([noise.total for noise in check.noises])[rate]
     Z, J = found.J[seen] / sigma[seen, None], innovations(check, chosen, found.J, seen, weight=weight)
-    F, k = J.T @ J, len(question.names)
+    F, k = J.T @ J, len(problem.names)
     if own:
         inner = F[k:, k:] + np.diag([12 / w**2 for w in ranges])
         taken = solve_scaled(inner, F[k:, :k])  # a drift with the slip is none where nothing moves
@@ -244,7 +246,7 @@ def _simulated(question: _Question, check: RunCheck, most: int) -> _Told:
     rest = found.y[seen] - short.observed[seen]
     spread = max(float(np.std(short.observed[seen])), 10 * float(sigma.mean())) if seen.any() else 1.0
     misfit = float(np.sqrt(np.mean(rest**2))) / spread if seen.any() else math.inf
-    return _Told(F, Z, misfit, found.status, float(found.reached))
+    return _RunInformation(F, Z, misfit, found.status, float(found.reached))
 
 
 def _chosen(size: int, most: int) -> tuple[NDArray[np.int64], float]:
@@ -271,19 +273,19 @@ def innovations(check: RunCheck, chosen: NDArray[np.int64], J: Array, used: Mask
     return np.asarray(math.sqrt(weight) * white[counts[used]])
 
 
-def _errors(question: _Question, told: Sequence[_Told]) -> tuple[dict[str, float], dict[str, float]]:
+def _errors(problem: _BoundProblem, information: Sequence[_RunInformation]) -> tuple[dict[str, float], dict[str, float]]:
     """Return errors and peaks of all that is asked for, from these runs together."""
-    errors, peaks, F = {}, {}, sum((t.F for t in told), np.zeros((len(question.names),) * 2))
-    for asked, column in question.asked.items():
-        at = question.names.index(column)
-        rest = [i for i, n in enumerate(question.names) if n in question.free and n != column]
-        error, alone = _error(F, at, rest, np.array([question.widths[question.names[i]] for i in rest]))
+    errors, peaks, F = {}, {}, sum((t.F for t in information), np.zeros((len(problem.names),) * 2))
+    for asked, column in problem.targets.items():
+        at = problem.names.index(column)
+        rest = [i for i, n in enumerate(problem.names) if n in problem.free and n != column]
+        error, alone = _error(F, at, rest, np.array([problem.widths[problem.names[i]] for i in rest]))
         unit = 1.0
         if asked == "lambda":
-            p = run_parameters(question.model, question.experiment, question.experiment.runs[0], question.values)
-            unit = float(p[question.model.index(column)])
+            p = run_parameters(problem.model, problem.experiment, problem.experiment.runs[0], problem.values)
+            unit = float(p[problem.model.index(column)])
         errors[asked] = error / unit if error / unit < UNDETERMINED else math.inf
-        peaks[asked] = SIZES[asked] * unit * max((float(np.abs(t.Z @ alone).max(initial=0.0)) for t in told), default=0.0)
+        peaks[asked] = SIZES[asked] * unit * max((float(np.abs(t.Z @ alone).max(initial=0.0)) for t in information), default=0.0)
     return errors, peaks
 
 

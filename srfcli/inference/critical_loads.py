@@ -16,7 +16,7 @@ from srfcli.data.values import CriticalLoads, Experiment
 from srfcli.inference.free_parameters import FreeParameter, Scale
 from srfcli.inference.thresholds import Match, Matcher
 
-IMPROBABLE = 1e-3  # chance of a chi2 of critical loads below which the model is said not to describe them
+MIN_P_VALUE = 1e-3  # chance of a chi2 of critical loads below which the model is said not to describe them
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def joined_slopes(matched: Matched, names: Sequence[str], varying: Mapping[str, 
     return out
 
 
-def chance_of(cost: float, freedom: float) -> float:
+def chi2_p_value(cost: float, freedom: float) -> float:
     """Return how likely a chi2 is to be as large by chance, 1 without degrees of freedom."""
     from scipy.special import chdtrc
 

@@ -12,9 +12,9 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.groups import GAUGE_NOISE, labels
 from srfcli.data.values import OBSERVABLES, CriticalLoads, Experiment, Run
-from srfcli.inference.critical_loads import Matched, chance_of
+from srfcli.inference.critical_loads import Matched, chi2_p_value
 from srfcli.inference.noise import Noise
-from srfcli.inference.prediction import own_names, own_start, run_parameters
+from srfcli.inference.prediction import run_parameters, run_specific_names, run_specific_start
 
 
 def inverse(information: Array) -> Array:
@@ -36,7 +36,7 @@ def solve_scaled(A: Array, b: Array) -> Array:
     return np.asarray((((vectors * inverse) @ (vectors.T @ (b.T / d).T)).T / d).T)
 
 
-def root(covariance: Array) -> Array:
+def principal_deviations(covariance: Array) -> Array:
     """Return the principal directions of a covariance, one standard deviation long each, as columns."""
     d = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(d, d))
@@ -130,7 +130,7 @@ class Problem:
     lower: Array
     upper: Array
     trend: str | None = None
-    held: Mapping[str, float] = field(default_factory=dict)
+    fixed_values: Mapping[str, float] = field(default_factory=dict)
     priors: tuple[tuple[tuple[str, ...], float], ...] = ()  # names, and the scatter of their values about an unknown mean
     tables: tuple[CriticalLoads, ...] = ()
     stability: GeneratedModel | None = None
@@ -157,7 +157,7 @@ class Problem:
 
     def named(self, theta: Array) -> dict[str, float]:
         """Return parameters by name, those that are held among them."""
-        return {**self.held, **dict(zip(self.names, np.asarray(theta).tolist(), strict=True))}
+        return {**self.fixed_values, **dict(zip(self.names, np.asarray(theta).tolist(), strict=True))}
 
     @cached_property
     def varying(self) -> dict[str, dict[str, str]]:
@@ -216,9 +216,9 @@ def fit_problem(
     rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names for _ in groups.get(n, [n])]
     names = [own for n in names for own in groups.get(n, [n])]
     for run in runs:
-        own = own_names(model, run, trend)
+        own = run_specific_names(model, run, trend)
         p = run_parameters(model, experiment, run, {})
-        rows += [own_start(model, run, p, name, trend) for name in own]
+        rows += [run_specific_start(model, run, p, name, trend) for name in own]
         names += own
     start, lower, upper = np.array(rows, dtype=float).T
     for name, low, high in zip(names, lower, upper, strict=True):
@@ -275,4 +275,4 @@ def between_groups(values: Array, covariance: Array) -> BetweenGroups:
     found = minimize_scalar(lambda s: about(s)[3], bounds=(0.0, most), method="bounded", options={"xatol": 1e-6 * most})
     scatter = float(found.x) if found.fun < about(0.0)[3] else 0.0
     mean, variance = about(scatter)[:2]
-    return BetweenGroups(mean, float(np.sqrt(variance)), scatter, chance_of(about(0.0)[2], k - 1))
+    return BetweenGroups(mean, float(np.sqrt(variance)), scatter, chi2_p_value(about(0.0)[2], k - 1))

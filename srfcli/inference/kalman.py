@@ -68,7 +68,7 @@ class Readings:
 
 
 @dataclass(frozen=True)
-class Kept:
+class SmootherInput:
     """What the smoother needs, before each reading is used: mean (n, a), covariance, transition since the one before (n, a, a).
 
     a is the number of states with those of the gauge noise after them; `gradient` (n, a) is that of the reading, `gain` (n, a)
@@ -96,7 +96,7 @@ class Innovations:
     reached: int
     steps: int
     bounded: int
-    kept: Kept | None
+    kept: SmootherInput | None
 
 
 def kalman_filter(
@@ -162,7 +162,7 @@ def kalman_filter(
         reached = min(reached, interruptible(lambda arguments=arguments: library.srf_filter(*arguments), stop))  # type: ignore[misc]
         count = min(LANES, k - first)
         nu_d[:, first : first + count], S_d[:, first : first + count] = own_nu[:, :count], own_S[:, :count]
-    kept = Kept(*arrays) if keep else None
+    kept = SmootherInput(*arrays) if keep else None
     return Innovations(nu, S, nu_d, S_d, reached, int(stats[0]), int(stats[2]), kept)
 
 

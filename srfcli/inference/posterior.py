@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError
-from srfcli.inference.fit import root
+from srfcli.inference.fit import principal_deviations
 from srfcli.inference.profile import CHI2_95, Interval, Refits, interval_end, quadratic
-from srfcli.inference.state_space import CLOSER, StateSpaceFit, along, maximise
+from srfcli.inference.state_space import INTERVAL_TOLERANCE, StateSpaceFit, maximise, point_on_ridge
 
 # Profile likelihood: each parameter held at a value, the others refitted.
 
@@ -41,10 +41,10 @@ def _end(found: StateSpaceFit, name: str, side: float, refits: Refits) -> float 
         value = best[k] + side * distance
         start = np.clip(x + covariance[:, k] / covariance[k, k] * (value - x[k]), likelihood.lower, likelihood.upper)
         start[k] = value
-        point = maximise(likelihood, start, held=(name,), close=CLOSER).point
+        point = maximise(likelihood, start, fixed=(name,), close=INTERVAL_TOLERANCE).point
         x = point.x if np.isfinite(point.log_likelihood) else x
         own = {n: point.values[n] for n in likelihood.problem.names}
-        return refits.met(2 * (found.log_likelihood - point.log_likelihood), own)
+        return refits.record(2 * (found.log_likelihood - point.log_likelihood), own)
 
     distance = interval_end(deviance, error, float(room))
     if distance is None:
@@ -61,7 +61,9 @@ def not_quadratic(found: StateSpaceFit) -> list[str]:
     likelihood, maximum, names = found.likelihood, found.maximum, []
     for j in np.flatnonzero(np.diag(maximum.covariance)[: len(likelihood.problem.names)] > 0).tolist():
         reach = np.sqrt(CHI2_95 * maximum.covariance[j, j])
-        ends = [2 * (found.log_likelihood - along(likelihood, maximum, j, side * reach).log_likelihood) for side in (-1, 1)]
+        ends = [
+            2 * (found.log_likelihood - point_on_ridge(likelihood, maximum, j, side * reach).log_likelihood) for side in (-1, 1)
+        ]
         if not quadratic(ends):
             names.append(likelihood.names[j])
     return names
@@ -69,16 +71,16 @@ def not_quadratic(found: StateSpaceFit) -> list[str]:
 
 # Draws from the posterior by Markov chains, under flat priors within the bounds, and what they are worth.
 
-EARLY_DRAWS = 250  # draws for each parameter after which the burn-in makes its proposals anew
-FEWEST_STEPS = 50  # between two of these, and of those kept: of fewer nobody could say what they are worth
-LEFT_OUT = 5.0  # correlation times that are left out at the beginning
-BURNT_IN = 1.03  # R-hat at which the burn-in may end
+ADAPTATION_DRAWS = 250  # draws for each parameter after which the burn-in makes its proposals anew
+MIN_STEPS = 50  # between two of these, and of those kept: of fewer nobody could say what they are worth
+DISCARDED_TIMES = 5.0  # correlation times that are left out at the beginning
+BURN_IN_R_HAT = 1.03  # R-hat at which the burn-in may end
 LONGEST_BURN_IN = 1000  # steps of burn-in
-INDEPENDENT = 0.85  # share of proposals that do not depend on where a chain is; the others stretch the ensemble
-WIDER = 1.2  # than the burn-in's draws: chains get stuck where proposals are rarer than the posterior
+INDEPENDENT_PROPOSALS = 0.85  # share of proposals that do not depend on where a chain is; the others stretch the ensemble
+PROPOSAL_SCALE = 1.2  # over the spread of the burn-in's draws: chains get stuck where proposals are rarer than the posterior
 OPEN_END = 2.0  # of log posterior, for a standard error that ends beyond a bound
-HEAVY = 10.0  # degrees of freedom of those proposals, so that no tail of the posterior is left out
-ENOUGH_EACH = 8  # draws of the burn-in for each coefficient of the ridge's bend
+PROPOSAL_DOF = 10.0  # degrees of freedom of those proposals, so that no tail of the posterior is left out
+DRAWS_PER_COEFFICIENT = 8  # draws of the burn-in for each coefficient of the ridge's bend
 
 
 @dataclass(frozen=True)
@@ -191,23 +193,23 @@ def draw(
         raise SrfError("`sample` needs emcee, which is not installed", 'pip install "srfcli[sample]"') from error
     k = len(names)
     chains = 2 * k + 4
-    every = max(FEWEST_STEPS, -(-EARLY_DRAWS * k // chains))
+    every = max(MIN_STEPS, -(-ADAPTATION_DRAWS * k // chains))
     rng = np.random.default_rng(seed)
     best, covariance = _inside(log_posterior, best, covariance, bounds)
     scale = _straight(log_posterior, best, covariance, bounds[0])
 
     def log_density(y: Array) -> float:
-        theta = scale.back(y)
+        theta = scale.inverse_transform(y)
         return log_posterior(theta) + float(np.sum(np.log(theta[scale.logarithmic])))
 
     over = np.where(scale.logarithmic, best, 1.0)
-    ridge = _Ridge(scale.there(best), root(covariance / np.outer(over, over)))
-    moves = [(emcee.moves.MHMove(ridge), INDEPENDENT), (emcee.moves.StretchMove(), 1.0 - INDEPENDENT)]
-    drawn = scale.back(ridge.back(rng.standard_normal((chains, k))))
-    start = scale.there(_within(drawn, bounds))
+    ridge = _Ridge(scale.transform(best), principal_deviations(covariance / np.outer(over, over)))
+    moves = [(emcee.moves.MHMove(ridge), INDEPENDENT_PROPOSALS), (emcee.moves.StretchMove(), 1.0 - INDEPENDENT_PROPOSALS)]
+    drawn = scale.inverse_transform(ridge.inverse_transform(rng.standard_normal((chains, k))))
+    start = scale.transform(_within(drawn, bounds))
     sampler = emcee.EnsembleSampler(chains, k, log_density, moves=moves)
     sampler._random = np.random.RandomState(seed)
-    steps, burnt, interrupted = max(-(-count // chains), FEWEST_STEPS), 0, False
+    steps, burnt, interrupted = max(-(-count // chains), MIN_STEPS), 0, False
     try:
         for number, _ in enumerate(sampler.sample(start, iterations=LONGEST_BURN_IN + steps), 1):
             if not burnt and number % every == 0:
@@ -215,7 +217,7 @@ def draw(
                 ridge.learn(later.reshape(-1, k))
                 independent = np.nanmin(np.maximum(effective_size(later), 1e-9))  # draws of the slowest parameter
                 slowness = later.shape[0] * chains / independent  # steps after which they are
-                mixed = number >= LEFT_OUT * slowness and r_hat(later).max() <= BURNT_IN
+                mixed = number >= DISCARDED_TIMES * slowness and r_hat(later).max() <= BURN_IN_R_HAT
                 burnt = number if mixed or number >= LONGEST_BURN_IN else 0
             progress(f"posterior: step {number}", number / (max(burnt, every) + steps))
             if burnt and number == burnt + steps:
@@ -226,7 +228,7 @@ def draw(
             raise
         burnt = burnt or sampler.iteration // 2
     accepted = float(np.mean(sampler.acceptance_fraction))
-    return Posterior(names, scale.back(sampler.get_chain(discard=burnt)), burnt, accepted, interrupted)
+    return Posterior(names, scale.inverse_transform(sampler.get_chain(discard=burnt)), burnt, accepted, interrupted)
 
 
 def _within(theta: Array, bounds: tuple[Array, Array]) -> Array:
@@ -262,12 +264,12 @@ class _Scale:
 
     logarithmic: NDArray[np.bool_]
 
-    def there(self, theta: Array) -> Array:
+    def transform(self, theta: Array) -> Array:
         """Return the coordinates of parameters (..., k)."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(self.logarithmic, np.log(theta), theta)
 
-    def back(self, y: Array) -> Array:
+    def inverse_transform(self, y: Array) -> Array:
         """Return the parameters at coordinates (..., k)."""
         return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, y, 0.0)), y)
 
@@ -323,21 +325,21 @@ class _Ridge:
             return
         self.centre, self.factor = draws.mean(axis=0), self._maximum @ vectors * np.sqrt(values)
         w = np.linalg.solve(self.factor, (draws - self.centre).T).T
-        self.spread = np.full(self.centre.size, WIDER)
+        self.spread = np.full(self.centre.size, PROPOSAL_SCALE)
         for j in range(1, self.centre.size):
             terms = self._terms(w, j)
             self.bends[j] = None
-            if len(w) >= ENOUGH_EACH * terms.shape[1]:
+            if len(w) >= DRAWS_PER_COEFFICIENT * terms.shape[1]:
                 self.bends[j] = bend = np.linalg.lstsq(terms, w[:, j], rcond=None)[0]
-                self.spread[j] = WIDER * np.std(w[:, j] - terms @ bend)
+                self.spread[j] = PROPOSAL_SCALE * np.std(w[:, j] - terms @ bend)
 
-    def there(self, y: Array) -> Array:
+    def transform(self, y: Array) -> Array:
         """Return z at y (n, k)."""
         w = np.linalg.solve(self.factor, (y - self.centre).T).T
         bent = [0.0 if bend is None else self._terms(w, j) @ bend for j, bend in enumerate(self.bends)]
         return (w - np.column_stack(np.broadcast_arrays(*bent, w[:, 0])[:-1])) / self.spread
 
-    def back(self, z: Array) -> Array:
+    def inverse_transform(self, z: Array) -> Array:
         """Return y at z (n, k)."""
         w = z * self.spread
         for j, bend in enumerate(self.bends):
@@ -347,12 +349,12 @@ class _Ridge:
 
     def log_density(self, y: Array) -> Array:
         """Return the logarithm of the proposals' density at y (n, k), up to a constant."""
-        return np.asarray(-0.5 * (HEAVY + y.shape[1]) * np.log1p(np.sum(self.there(y) ** 2, axis=1) / HEAVY))
+        return np.asarray(-0.5 * (PROPOSAL_DOF + y.shape[1]) * np.log1p(np.sum(self.transform(y) ** 2, axis=1) / PROPOSAL_DOF))
 
     def __call__(self, x: Array, random: Any) -> tuple[Array, Array]:
         """Return where chains at x (n, k) may go, and the logarithms of the ratios of densities."""
-        normal, scale = random.standard_normal(x.shape), random.chisquare(HEAVY, size=(x.shape[0], 1)) / HEAVY
-        moved = self.back(normal / np.sqrt(scale))
+        normal, scale = random.standard_normal(x.shape), random.chisquare(PROPOSAL_DOF, size=(x.shape[0], 1)) / PROPOSAL_DOF
+        moved = self.inverse_transform(normal / np.sqrt(scale))
         return moved, self.log_density(x) - self.log_density(moved)
 
 

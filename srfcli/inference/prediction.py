@@ -26,15 +26,17 @@ GAUGES = {"slip": ("slip",), "contact_area": ("area", "area_growth")}  # of an o
 FREE_START_WIDTH = 0.1  # least distance of the bounds of a free start's friction: a run may begin without any
 
 
-def own_names(model: GeneratedModel, run: Run, trend: str | None) -> list[str]:
+def run_specific_names(model: GeneratedModel, run: Run, trend: str | None) -> list[str]:
     """Return the names of what this run adds to the parameters."""
     initial = [f"{run.name}.mu", *(f"{run.name}.{s}" for s in _ages(model))] if run.initial == "free" else []
     gauges = [f"{run.name}.{n}" for s in run.others for n in GAUGES.get(s.observable, ())]
     return initial + ([f"{run.name}.trend"] if trend else []) + gauges
 
 
-def own_start(model: GeneratedModel, run: Run, p: Array, name: str, trend: str | None = None) -> tuple[float, float, float]:
-    """Return a start value and bounds for one of `own_names`; `trend` is what a trend is proportional to, slip if left out."""
+def run_specific_start(
+    model: GeneratedModel, run: Run, p: Array, name: str, trend: str | None = None
+) -> tuple[float, float, float]:
+    """Return a start value and bounds for one of `run_specific_names`; a trend is proportional to `trend`, slip if left out."""
     kind = name.rpartition(".")[2]
     if kind == "trend":
         steepest = 10 * float(np.ptp(run.observed)) / max(float(np.ptp(basis(run, trend or "slip"))), 1e-9)
@@ -86,29 +88,34 @@ def basis(run: Run, trend: str) -> Array:
 
 
 def start_state(
-    model: GeneratedModel, run: Run, p: Array, values: Mapping[str, float], by: Sequence[str], numbers: Sequence[int] = ()
+    model: GeneratedModel,
+    run: Run,
+    p: Array,
+    values: Mapping[str, float],
+    by: Sequence[str],
+    coefficient_indices: Sequence[int] = (),
 ) -> tuple[Array, Array]:
     """Return the state (n,) at the first sample and its derivatives (n, k): steady sliding, or what `values` say of a free start.
 
-    `numbers` are places in `p`, beyond the parameters, of tables' numbers: columns after those of `by`.
+    `coefficient_indices` are places in `p`, beyond the parameters, of tables' coefficients: columns after those of `by`.
 
     A free start is in balance: the friction law gives the slip velocity at which mu and the ages meet, z follows it.
     """
-    places = {name: model.index(name) for name in by if name in model.names}
-    places |= {f"[{place}]": place for place in numbers}
-    by = [*by, *(f"[{place}]" for place in numbers)]
+    indices = {name: model.index(name) for name in by if name in model.names}
+    indices |= {f"[{place}]": place for place in coefficient_indices}
+    by = [*by, *(f"[{place}]" for place in coefficient_indices)]
     if run.initial != "free":
         x0 = np.asarray(model.steady(p))
         S0 = np.zeros((x0.size, len(by)))
         for k, name in enumerate(by):
-            if name in places:
-                S0[:, k] = derivative(model.steady, p, places[name])
+            if name in indices:
+                S0[:, k] = derivative(model.steady, p, indices[name])
         return x0, S0
-    return _balanced(model, run, p, values, by, places)
+    return _free_start(model, run, p, values, by, indices)
 
 
-def _balanced(
-    model: GeneratedModel, run: Run, p: Array, values: Mapping[str, float], by: Sequence[str], places: Mapping[str, int]
+def _free_start(
+    model: GeneratedModel, run: Run, p: Array, values: Mapping[str, float], by: Sequence[str], indices: Mapping[str, int]
 ) -> tuple[Array, Array]:
     states = list(model.states)
     V, W = run.drive.at(float(run.t[0])), run.first_load
@@ -135,8 +142,8 @@ def _balanced(
         elif own in ages:
             S[states.index(own), k] = 1.0
             S[iv, k] = -of_state[states.index(own)] / of_state[iv]
-        elif name in places:
-            S[iv, k] = -derivative(lambda q: model.friction(x.astype(complex), V, W, 0.0, q), p, places[name]) / of_state[iv]
+        elif name in indices:
+            S[iv, k] = -derivative(lambda q: model.friction(x.astype(complex), V, W, 0.0, q), p, indices[name]) / of_state[iv]
     if "u" in states:
         stiffness = model.namespace.get("stiffness") or (lambda x, V, W, W_dot, p: p[model.index("K")])
         K, u = float(stiffness(x, V, W, 0.0, p)), states.index("u")
@@ -144,8 +151,8 @@ def _balanced(
         for k, name in enumerate(by):
             if name == f"{run.name}.mu":
                 S[u, k] = W / K
-            elif name in places:
-                S[u, k] = -W * mu / K**2 * derivative(lambda q: stiffness(x, V, W, 0.0, q), p, places[name])
+            elif name in indices:
+                S[u, k] = -W * mu / K**2 * derivative(lambda q: stiffness(x, V, W, 0.0, q), p, indices[name])
     if "z" in states:
         x[states.index("z")] = np.exp(x[iv])
         S[states.index("z")] = np.exp(x[iv]) * S[iv]
@@ -193,11 +200,11 @@ def run_parameters(model: GeneratedModel, experiment: Experiment, run: Run, valu
     if "K" in listed:
         base["K"] = listed["K"] * stiffness_share(experiment, run)
     if "begin" in model.names:
-        base |= of_run(run)
+        base |= effect_inputs(run)
     return model.vector({**base, "V": run.drive.at(float(run.t[0])), "W0": run.first_load})
 
 
-def of_run(run: Run) -> dict[str, float]:
+def effect_inputs(run: Run) -> dict[str, float]:
     """Return what effects ask of a recording: where and when it begins, and the load's modulation as it is in the data."""
     weighed = float(run.observable != "elongation")
     return {"start": run.start, "begin": float(run.t[0]), "weighed": weighed, **_modulation(run)}
@@ -272,8 +279,8 @@ def predict(
     """Return the observable of `run` at its sample times, with derivatives by the parameters `by`.
 
     Of a model with tables, J goes on with a column for each number of the tables in `by_tables`.
-    It starts in steady sliding, or where `values` say (see `own_names`). A trend is added to the observable: values["RUN.trend"]
-    times displacement or time. Values are in um, s, N.
+    It starts in steady sliding, or where `values` say (see `run_specific_names`). A trend is added to the observable:
+    values["RUN.trend"] times displacement or time. Values are in um, s, N.
     """
     p = run_parameters(model, experiment, run, values)
     if tables:
@@ -282,17 +289,17 @@ def predict(
     own = [k for k, n in enumerate(by) if n not in still and (n in model.names or n.startswith(f"{run.name}."))]
     moving = [k for k in own if not by[k].endswith(".trend")]
     names = [by[k] for k in moving]
-    places = [model.index(n) if n in model.names else -1 for n in names]
-    numbers = [int(p[len(model.names) + 4 * i]) + j for i in by_tables for j in range(tables[i].coefficients.size)]
-    share = np.array([stiffness_share(experiment, run) if n == "K" else 1.0 for n in names] + [1.0] * len(numbers))
-    x0, S0 = start_state(model, run, p, values, names, numbers)
+    indices = [model.index(n) if n in model.names else -1 for n in names]
+    coefficient_indices = [int(p[len(model.names) + 4 * i]) + j for i in by_tables for j in range(tables[i].coefficients.size)]
+    share = np.array([stiffness_share(experiment, run) if n == "K" else 1.0 for n in names] + [1.0] * len(coefficient_indices))
+    x0, S0 = start_state(model, run, p, values, names, coefficient_indices)
     size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
     motion = integrate(
-        model, p[: len(model.names)], drive=run.drive, load=run.load, t=run.t, start=x0, by=places, S0=S0, tables=tables,
+        model, p[: len(model.names)], drive=run.drive, load=run.load, t=run.t, start=x0, by=indices, S0=S0, tables=tables,
         by_tables=by_tables, rtol=rtol, atol=rtol * size,
     )  # fmt: skip
-    y, slopes = _observe(model, run, motion.x, motion.S, p, [*places, *numbers])
-    J = np.zeros((run.t.size, len(by) + len(numbers)))
+    y, slopes = _observe(model, run, motion.x, motion.S, p, [*indices, *coefficient_indices])
+    J = np.zeros((run.t.size, len(by) + len(coefficient_indices)))
     J[:, [*moving, *range(len(by), J.shape[1])]] = slopes * share
     if trend:
         y = y + values[f"{run.name}.trend"] * basis(run, trend)
@@ -300,12 +307,12 @@ def predict(
     return Prediction(y, J, motion.x, motion.status, motion.reached)
 
 
-def _observe(model: GeneratedModel, run: Run, x: Array, S: Array, p: Array, places: Sequence[int]) -> tuple[Array, Array]:
+def _observe(model: GeneratedModel, run: Run, x: Array, S: Array, p: Array, indices: Sequence[int]) -> tuple[Array, Array]:
     """Return the recorded quantity and its derivatives: elongation u, spring force K u, or friction K u/W."""
     V, (W, W_dot) = run.drive(run.t), run.load(run.t)
     K = p[model.index("K")]
     factor = np.broadcast_to(per_elongation(run.observable, K, W), W.shape)
-    J = np.zeros((run.t.size, len(places)))
+    J = np.zeros((run.t.size, len(indices)))
     recorded = model.namespace.get("OBSERVED", "u")
     if recorded in model.states:
         i = model.states.index(recorded)
@@ -314,11 +321,11 @@ def _observe(model: GeneratedModel, run: Run, x: Array, S: Array, p: Array, plac
         reading = model.namespace.get("reading") or model.elongation
         with np.errstate(all="ignore"):
             u = np.asarray(reading(x, V, W, W_dot, p))
-            for j in range(x.shape[1] if places else 0):
+            for j in range(x.shape[1] if indices else 0):
                 J += derivative(lambda y: reading(y, V, W, W_dot, p), x, j)[:, None] * S[:, j, :]
-            for k, i in enumerate(places):
+            for k, i in enumerate(indices):
                 if i >= 0:
                     J[:, k] += derivative(lambda q: reading(x.astype(complex), V, W, W_dot, q), p, i)
-    if run.observable != "elongation" and model.index("K") in places:
-        J[:, list(places).index(model.index("K"))] += u / K
+    if run.observable != "elongation" and model.index("K") in indices:
+        J[:, list(indices).index(model.index("K"))] += u / K
     return factor * u, factor[:, None] * J

@@ -10,9 +10,10 @@ import numpy as np
 CHI2_95 = 3.841458820694124  # of chi-squared with one degree of freedom, 95 %
 OPEN_INTERVAL = 8.0  # half-widths that the standard error wants: an interval that has not ended there is open
 REFITS = 12  # of one end at most; the secant needs three or four
-SETTLED = 0.01  # in the root of the deviance, which is 1.96 at the end: half a per cent of the interval
+PROFILE_TOLERANCE = 0.01  # in the root of the deviance, which is 1.96 at the end: half a per cent of the interval
 LIKELIER = 0.05  # in log likelihood, above the fit: a refit is a likelier maximum then, and no rest of convergence
-FARTHER = 1.5  # times 1.96 standard errors: an interval cut there misses the value on that side in 10 of 100 cases, not in 2.5
+# times 1.96 standard errors: an interval cut there misses the value on that side in 10 of 100 cases, not in 2.5
+MAX_INTERVAL_RATIO = 1.5
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Refits:
     def __init__(self) -> None:
         self.gain, self.likelier = 0.0, None  # type: float, Mapping[str, float] | None
 
-    def met(self, deviance: float, values: Mapping[str, float]) -> float:
+    def record(self, deviance: float, values: Mapping[str, float]) -> float:
         """Return a refit's deviance, when it was looked at."""
         if -0.5 * deviance > max(self.gain, LIKELIER):
             self.gain, self.likelier = -0.5 * deviance, values
@@ -44,8 +45,8 @@ class Refits:
 
 
 def quadratic(deviances: Sequence[float]) -> bool:
-    """Return whether deviances at 1.96 standard errors either side are what these say, within FARTHER squared."""
-    return CHI2_95 / FARTHER**2 < min(deviances) <= max(deviances) < CHI2_95 * FARTHER**2
+    """Return whether deviances at 1.96 standard errors either side are what these say, within MAX_INTERVAL_RATIO squared."""
+    return CHI2_95 / MAX_INTERVAL_RATIO**2 < min(deviances) <= max(deviances) < CHI2_95 * MAX_INTERVAL_RATIO**2
 
 
 def interval_end(deviance: Callable[[float], float], error: float, room: float) -> float | None:
@@ -62,7 +63,7 @@ def interval_end(deviance: Callable[[float], float], error: float, room: float) 
     for _ in range(REFITS):
         cost, before = deviance(step), here
         here = (step, float(np.sign(cost) * np.sqrt(abs(cost))) - wanted)
-        if abs(here[1]) < SETTLED:
+        if abs(here[1]) < PROFILE_TOLERANCE:
             break
         if here[1] > 0:
             outside = step

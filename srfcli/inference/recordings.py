@@ -15,7 +15,15 @@ from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment, Run
 from srfcli.inference.fit import BetweenGroups, Fit, Problem, between_groups, fit_problem
 from srfcli.inference.shared_field import fit_shared
-from srfcli.inference.state_space import NEEDED, Interrupted, StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
+from srfcli.inference.state_space import (
+    SIGNIFICANT_GAIN,
+    Interrupted,
+    StateSpaceFit,
+    as_fit,
+    fit_state_space,
+    interrupted_fit,
+    with_priors,
+)
 from srfcli.laws.registry import Registry
 
 # The fit of an experiment's recordings as `srf fit` makes it: which likelihood, which starts, whose random friction field.
@@ -53,8 +61,8 @@ class RecordingFit:
     scatter: Mapping[str, BetweenGroups | None] = field(default_factory=dict)
 
 
-MANY_GROUPS = 5  # groups from which their scatter is known well enough to be a prior: to a third of itself
-NO_SCATTER = 0.01  # of the errors: a scatter that stands for none at all
+MIN_GROUPS_FOR_PRIOR = 5  # groups from which their scatter is known well enough to be a prior: to a third of itself
+MIN_SCATTER = 0.01  # of the errors: a scatter that stands for none at all
 
 
 def _scatter(found: StateSpaceFit) -> dict[str, BetweenGroups | None]:
@@ -69,7 +77,7 @@ def _scatter(found: StateSpaceFit) -> dict[str, BetweenGroups | None]:
     return told
 
 
-def _drawn_together(found: StateSpaceFit, scatter: Mapping[str, BetweenGroups | None]) -> StateSpaceFit:
+def _with_shrinkage(found: StateSpaceFit, scatter: Mapping[str, BetweenGroups | None]) -> StateSpaceFit:
     """Return the fit with the values of many groups drawn towards their means.
 
     The prior is Gaussian, of unknown mean; its standard deviation is how values scatter beyond their errors: empirical Bayes.
@@ -77,9 +85,9 @@ def _drawn_together(found: StateSpaceFit, scatter: Mapping[str, BetweenGroups | 
     priors, errors = [], np.sqrt(np.diag(found.covariance))
     for n, own in scatter.items():
         names = found.likelihood.problem.groups[n]
-        if own is not None and len(names) >= MANY_GROUPS:
+        if own is not None and len(names) >= MIN_GROUPS_FOR_PRIOR:
             error = float(np.mean(errors[[found.likelihood.names.index(name) for name in names]]))
-            priors.append((names, max(own.scatter, NO_SCATTER * error)))
+            priors.append((names, max(own.scatter, MIN_SCATTER * error)))
     return with_priors(found, priors) if priors else found
 
 
@@ -135,10 +143,10 @@ def fit_recordings(
     try:
         likeliest, rows, interrupted = fit_from_several(problem, smooth=smooth, count=starts, seed=seed, progress=progress)
     except Interrupted as error:
-        found = stopped(problem, error.found)
+        found = interrupted_fit(problem, error.found)
         return RecordingFit(problem, as_fit(found), found, _track(found), (), Status.INTERRUPTED)
     scatter = _scatter(likeliest)
-    found = _drawn_together(likeliest, scatter) if prior and not interrupted else likeliest
+    found = _with_shrinkage(likeliest, scatter) if prior and not interrupted else likeliest
     best = as_fit(found)
     status = Status.INTERRUPTED if interrupted else best.status
     result = RecordingFit(found.likelihood.problem, best, found, _track(found), tuple(rows), status, scatter)
@@ -146,13 +154,13 @@ def fit_recordings(
         return result
     try:
         asked = ask_shared and track is None and not (experiment.vary or any(run.others for run in problem.runs))
-        if not (track == "shared" or (asked and field_correlation(found) > ALIKE_FIELDS)):
+        if not (track == "shared" or (asked and field_correlation(found) > SHARED_FIELD_CORRELATION)):
             return result
         tabled = open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),))
         shared, field = fit_shared(replace(problem, model=tabled), best, progress=progress)
     except KeyboardInterrupt:
         return replace(result, status=Status.INTERRUPTED)
-    if track is None and shared.log_likelihood < best.log_likelihood + NEEDED:
+    if track is None and shared.log_likelihood < best.log_likelihood + SIGNIFICANT_GAIN:
         return result
     common = FittedField(field.amplitude, field.length, True) if field.amplitude else FittedField()
     return replace(result, fit=shared, state_space=None, friction_field=common, status=shared.status)
@@ -168,7 +176,7 @@ def _track(found: StateSpaceFit) -> FittedField | None:
 # Several starts: the file's own, and others drawn over the bounds, so that a false minimum is found out.
 
 START_SPREAD = 0.3  # of the way from the start value to each bound, at most
-ONE_MINIMUM = 0.5  # standard errors between two minima that count as one
+SAME_MINIMUM_DISTANCE = 0.5  # standard errors between two minima that count as one
 
 
 def start_points(problem: Problem, count: int, seed: int) -> list[Array]:
@@ -214,13 +222,13 @@ def fit_from_several(
     best = max(fits, key=lambda f: f.log_likelihood)
     errors = np.maximum(np.sqrt(np.diag(best.covariance)), 1e-300)
     away = [max(abs(f.values[n] - best.values[n]) / e for n, e in zip(problem.names, errors, strict=False)) for f in fits]
-    rows = [(f.log_likelihood, d < ONE_MINIMUM) for f, d in zip(fits, away, strict=True)]
+    rows = [(f.log_likelihood, d < SAME_MINIMUM_DISTANCE) for f, d in zip(fits, away, strict=True)]
     return best, rows, interrupted
 
 
 # Whether all runs have one and the same random friction field.
 
-ALIKE_FIELDS = 0.5  # mean correlation of the fields of two runs from which one field for all is fitted
+SHARED_FIELD_CORRELATION = 0.5  # mean correlation of the fields of two runs from which one field for all is fitted
 
 
 def field_correlation(found: StateSpaceFit) -> float:

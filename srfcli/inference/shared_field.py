@@ -22,18 +22,19 @@ from srfcli.inference.fit import Fit, Problem, RunFit, inverse, solve_scaled
 from srfcli.inference.noise import Noise, difference_level, estimate_noise, log_determinant, stretches, whiten
 from srfcli.inference.prediction import Prediction, predict
 
-KNOTS = 150  # in the longest slip of a run: 0.8 um of a slider's 120, over half of which contacts are renewed
-MOST_KNOTS = 300  # coefficients of a track: a longer one has wider knots
+KNOTS_IN_SLIP = 150  # in the longest slip of a run: 0.8 um of a slider's 120, over half of which contacts are renewed
+MAX_KNOTS = 300  # coefficients of a track: a longer one has wider knots
 AMPLITUDES = np.array([0.0, *np.geomspace(2e-5, 3e-3, 12)])
 LENGTHS = np.geomspace(1 / 120, 1 / 4, 6)  # of the field that are tried, over the longest slip of a run
 FIELD_ROUNDS = 4  # of field, parameters and noise in turn
 ROUNDS_AGREE = 0.5  # in log likelihood, between two rounds that agree
-MOST_STEPS = 25
+MAX_MARQUARDT_STEPS = 25
 LEAST_GAIN = 0.02  # gain of twice the log likelihood below which the minimum is reached
 EARLY_GAIN = 2.0  # the same while field and noise still change
 FAR_GAINS = ((1.5, 1e-6), (4.0, 1e-4), (np.inf, 1e-2))  # of chi-squared, the same up to so many times the samples
-ROUGHLY = 6.0  # chi-squared per sample within which the field is estimated: farther off it would take up what is not its own
-UNREACHED = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
+# chi-squared per sample within which the field is estimated: farther off it would take up what is not its own
+MAX_CHI2_PER_SAMPLE = 6.0
+UNREACHED_RESIDUAL = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
 OVERFLOWN_SLOPE = 1e100  # a slope that is no slope any more: its square would overflow
 
 
@@ -51,7 +52,7 @@ class FieldPrior:
         return self.amplitude * np.linalg.cholesky(K)
 
 
-USUAL = FieldPrior(3e-4, 1 / 15)  # until its own is estimated: polished contacts wander by so much; over the longest slip
+DEFAULT_PRIOR = FieldPrior(3e-4, 1 / 15)  # until its own is estimated: polished contacts wander by so much; over the longest slip
 
 
 def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] = lambda text: None) -> tuple[Fit, FieldPrior]:
@@ -88,11 +89,11 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
 def _track(runs: Sequence[Run], slip: float) -> Spline:
     """Return a smooth track that covers the slip of these runs, the longest of which is `slip`."""
     low, high = min(r.start for r in runs), max(r.start + float(r.drive.displacement(r.t)[-1]) for r in runs)
-    spacing = max(slip / KNOTS, (high - low) / (MOST_KNOTS - 6))
+    spacing = max(slip / KNOTS_IN_SLIP, (high - low) / (MAX_KNOTS - 6))
     return Spline.over(low - spacing, high + 2 * spacing, spacing)
 
 
-def _judged(likelihood: SharedLikelihood, point: Point, name: str) -> RunFit:
+def _judged(likelihood: SharedLikelihood, point: SharedFieldPoint, name: str) -> RunFit:
     run = next(r for r in likelihood.problem.experiment.runs if r.name == name)
     y = likelihood.predicted(run, point.theta, point.track, slopes=False).y
     residual, parts = run.observed - y, stretches(run.t, run.used)
@@ -100,8 +101,8 @@ def _judged(likelihood: SharedLikelihood, point: Point, name: str) -> RunFit:
 
 
 @dataclass(frozen=True)
-class Point:
-    """Parameters and track, what they predict, and the normal equations there: `N` and `g` over (theta, numbers), theta scaled.
+class SharedFieldPoint:
+    """Parameters and track, what they predict, and normal equations: `N` and `g` over (theta, coefficients), theta scaled.
 
     `log_likelihood` is that of the whitened residuals; `chi2` their sum of squares.
     """
@@ -135,14 +136,14 @@ class SharedLikelihood:
         self.samples = sum(int(run.used.sum()) for run in problem.runs)
 
     def predicted(self, run: Run, theta: Array, track: Spline, *, slopes: bool = True) -> Prediction:
-        """Return the prediction of a run, with slopes by parameters and by the numbers of the track."""
+        """Return the prediction of a run, with slopes by parameters and by the coefficients of the track."""
         problem = self.problem
         return predict(
             problem.model, problem.experiment, run, problem.named(theta), by=problem.names if slopes else (),
             trend=None if run.holdout else problem.trend, tables=(track,), by_tables=(0,) if slopes else (),
         )  # fmt: skip
 
-    def at(self, theta: Array, track: Spline, noise: Mapping[str, Noise], prior: FieldPrior) -> Point:
+    def at(self, theta: Array, track: Spline, noise: Mapping[str, Noise], prior: FieldPrior) -> SharedFieldPoint:
         """Return everything at these parameters and this track."""
         n, k = theta.size, theta.size + track.coefficients.size
         N, g, chi2, total, found = np.zeros((k, k)), np.zeros(k), 0.0, 0.0, {}
@@ -151,8 +152,8 @@ class SharedLikelihood:
             p = found[run.name] = self.predicted(run, theta, track)
             parts, own = stretches(run.t, run.used), noise[run.name]
             difference = run.observed - p.y
-            bad = ~((np.abs(difference) < UNREACHED * own.innovation) & (np.abs(p.J) < OVERFLOWN_SLOPE).all(axis=1))
-            difference[bad] = UNREACHED * own.innovation
+            bad = ~((np.abs(difference) < UNREACHED_RESIDUAL * own.innovation) & (np.abs(p.J) < OVERFLOWN_SLOPE).all(axis=1))
+            difference[bad] = UNREACHED_RESIDUAL * own.innovation
             J = np.where(bad[:, None], 0.0, p.J)
             J[:, :n] *= self.scale
             white = whiten(own, np.column_stack([difference, J]), parts)
@@ -161,16 +162,16 @@ class SharedLikelihood:
             g += slopes.T @ r
             chi2 += float(r @ r)
             total -= 0.5 * float(r @ r) + log_determinant(own, parts) + 0.5 * r.size * np.log(2 * np.pi)
-        return Point(theta, track, prior, found, N, g, chi2, total)
+        return SharedFieldPoint(theta, track, prior, found, N, g, chi2, total)
 
-    def minimise(self, point: Point, noise: Mapping[str, Noise], *, settled: float = LEAST_GAIN) -> Point:
+    def minimise(self, point: SharedFieldPoint, noise: Mapping[str, Noise], *, settled: float = LEAST_GAIN) -> SharedFieldPoint:
         """Return the most probable parameters and coefficients under this noise and field, by Levenberg and Marquardt."""
         problem, damping = self.problem, 0.0
         n, low, high = point.theta.size, problem.lower, problem.upper
         point = self.at(point.theta, point.track, noise, point.prior)
         rough = point.prior.amplitude > 0
         L = point.prior.root(point.track.nodes) if rough else np.zeros((0, 0))
-        for _ in range(MOST_STEPS if n or rough else 0):
+        for _ in range(MAX_MARQUARDT_STEPS if n or rough else 0):
             free = np.ones(n, dtype=bool)
             while True:  # parameters that a step would push out stay at their bounds
                 move, gain = self._step(point, L, free, damping)
@@ -186,27 +187,27 @@ class SharedLikelihood:
             if gained > 0:
                 point = trial
                 damping = 0.0 if damping < 1e-6 else damping / 8
-                if gained < self.worth(point, settled):
+                if gained < self.least_gain(point, settled):
                     break
             else:
-                if gain < self.worth(point, settled) or damping > 1e6:
+                if gain < self.least_gain(point, settled) or damping > 1e6:
                     break
                 damping = max(8 * damping, 1e-4)
         return point
 
-    def worth(self, point: Point, settled: float) -> float:
+    def least_gain(self, point: SharedFieldPoint, settled: float) -> float:
         """Return the gain below which a further step is not worth it."""
         share = point.chi2 / max(self.samples, 1)
         return max(settled, next(far for most, far in FAR_GAINS if share < most or most == np.inf) * point.chi2)
 
-    def prior(self, point: Point) -> FieldPrior:
+    def prior(self, point: SharedFieldPoint) -> FieldPrior:
         """Return the field at which the marginal likelihood is largest, the one so far where that means nothing."""
-        if point.chi2 > ROUGHLY * self.samples:
-            return point.prior if point.prior.amplitude else replace(USUAL, length=self.slip * USUAL.length)
+        if point.chi2 > MAX_CHI2_PER_SAMPLE * self.samples:
+            return point.prior if point.prior.amplitude else replace(DEFAULT_PRIOR, length=self.slip * DEFAULT_PRIOR.length)
         return marginal(point.N, point.g, point.theta.size, point.track, point.log_likelihood, self.grid)[1]
 
-    def _step(self, point: Point, L: Array, free: Array, damping: float) -> tuple[Array, float]:
-        """Return the step over (scaled theta, numbers), and what it should gain in minus twice the log posterior."""
+    def _step(self, point: SharedFieldPoint, L: Array, free: Array, damping: float) -> tuple[Array, float]:
+        """Return the step over (scaled theta, coefficients), and what it should gain in minus twice the log posterior."""
         n = free.size
         T = np.zeros((point.g.size, int(free.sum()) + L.shape[1]))
         T[np.nonzero(free)[0], np.arange(free.sum())] = 1.0
@@ -222,7 +223,7 @@ class SharedLikelihood:
         x = np.linalg.solve(A, b)
         return T @ x, float(x @ b)
 
-    def noise(self, point: Point) -> dict[str, Noise]:
+    def noise(self, point: SharedFieldPoint) -> dict[str, Noise]:
         """Return the noise of each run's residuals."""
         found = {}
         for run in self.problem.runs:
@@ -230,7 +231,7 @@ class SharedLikelihood:
             found[run.name] = estimate_noise(residual, stretches(run.t, run.used & np.isfinite(residual)))
         return found
 
-    def covariance(self, point: Point) -> Array:
+    def covariance(self, point: SharedFieldPoint) -> Array:
         """Return the covariance of the free parameters, the track's uncertainty included."""
         n = point.theta.size
         information = point.N[:n, :n]

@@ -27,20 +27,20 @@ from scipy.special import erfcx
 from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.data.gauge import CORRELATION_TIMES, FASTEST_OSCILLATION, PROCESSES, QUALITIES, QUALITY
+from srfcli.data.gauge import CORRELATION_TIMES, FASTEST_OSCILLATION, PROCESSES, QUALITIES, QUALITY, SAME_RATE
 from srfcli.data.noise import calm_level, carried
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import Fit, Problem, RunFit, inverse
-from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Readings, Smoothed, kalman_filter, smooth
+from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Readings, Smoothed, SmootherInput, kalman_filter, smooth
 from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
     basis,
     derivative,
     first_elongation,
-    own_names,
-    own_start,
     run_parameters,
+    run_specific_names,
+    run_specific_start,
     start_state,
     stiffness_share,
 )
@@ -48,12 +48,12 @@ from srfcli.inference.prediction import (
 T = TypeVar("T")
 Kind: TypeAlias = tuple[str, float, str]  # of gauge noise: an observable, the spacing of its samples, a group of runs or ""
 FILTER_RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
-FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
+FREE_RUNNING_RTOL_FACTOR = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
 # Fields under which a fit begins: amplitude over friction, length over the longest slip / LENGTHS_IN_SLIP. One after the other,
 # while none leads near a maximum under a faint field
-WIDE = ((0.01, 3.0), (0.01, 10.0), (0.003, 1.0), (0.3, 1.0))
-SHORT = (1.0, 0.25, 0.06)  # lengths of faint fields that are tried, over the same
+WIDE_FIELDS = ((0.01, 3.0), (0.01, 10.0), (0.003, 1.0), (0.3, 1.0))
+FAINT_FIELD_LENGTHS = (1.0, 0.25, 0.06)  # lengths of faint fields that are tried, over the same
 NOT_CONVERGED = 3.0  # standard errors from its maximum at which a fit is none
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
 LEAST_FIELD = 1e-6  # the least amplitude of a field, over the friction of the recordings
@@ -62,13 +62,14 @@ FAINT_FIELDS = (0.03, 0.1, 0.3, 1.0)  # amplitudes over FAINT_FIELD, that are tr
 FIELD_STEPS = 6  # of the trial of a small field beside a fit without one: parameters that are off may hide it
 TRIAL_STEPS = 12  # of scoring from another start, to see whether it leads to a likelier maximum
 FIELD_SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
-NEEDED = 2.0  # gain in log likelihood that keeps a field, or one that all runs share, and from which a maximum is another one
-CLOSE_CALL = 50.0  # in log likelihood, by which a fit that was broken off early may be behind and still be finished
-HOPELESS = 1000.0  # in log likelihood below what it is to replace or to extend, from where a model is not worth a fit
+# gain in log likelihood that keeps a field, or one that all runs share, and from which a maximum is another one
+SIGNIFICANT_GAIN = 2.0
+EARLY_STOP_DEFICIT = 50.0  # in log likelihood, by which a fit that was broken off early may be behind and still be finished
+PRUNING_DEFICIT = 1000.0  # in log likelihood below what it is to replace or to extend, from where a model is not worth a fit
 LENGTHS_IN_SLIP = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
 SCORING_STEPS = 40  # of Fisher scoring
 MANY_READINGS = 20_000  # of all runs, beyond which a fit begins with a part of them: it finds the field and the first digits
-MOST_WORK = 5  # times the steps of integration of the point before, after which a trial is given up
+MAX_WORK_RATIO = 5  # times the steps of integration of the point before, after which a trial is given up
 WIDTHS = (0.1, 0.03, 0.01)  # of each parameter, within which a reading's derivatives are to hold, one after the other
 WIDEST_ERRORS = 1000.0  # times that width, in standard errors: what readings tell sharply together may still be uncertain
 WEIGHT_ROUNDS = 12  # of weights and standard errors, each from the other
@@ -80,25 +81,29 @@ PEAKS, PEAK_STEPS = 3, 3  # of a scan that are looked at closer, and the steps o
 PROBE = 10.0  # standard errors along a ridge, at which the likelihood is asked for
 LOST_CURVATURE = 0.5  # share of what derivatives want at a probe, below which there are other maxima
 RIDGE_STRIDE, RIDGE_REACH = 0.05, 0.5  # of a parameter, where maxima beside one are looked for, and how far a probe may go
-DOWN = 10.0  # in log likelihood, by how much less likely than without a field a faint one may be and be averaged over
+# in log likelihood, by how much less likely than without a field a faint one may be and be averaged over
+FAINT_FIELD_DEFICIT = 10.0
 NEIGHBOUR_STEPS = (16, 64)  # of two standard errors to either side, least and most, in which other maxima are looked for
-HOPS = 16  # from one maximum to a likelier one beside it, at most: from start values 30 % off eight strides, each a hop or two
-FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
-UNFELT = 1e-6  # twice the log likelihood that a parameter changes between its bounds, below which its score is rounding
-FARTHEST_UPDATE = 3.0  # by a reading of ln v and ln PHI, a factor of 20 in v and PHI; standard deviations of the field
-FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
-BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
-CREEP = 0.1  # share of the gain expected by the score below which readings are weighted otherwise
+# from one maximum to a likelier one beside it, at most: from start values 30 % off eight strides, each a hop or two
+MAX_RIDGE_MOVES = 16
+MIN_EIGENVALUE = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
+MIN_SENSITIVITY = 1e-6  # twice the log likelihood that a parameter changes between its bounds, below which its score is rounding
+MAX_UPDATE = 3.0  # by a reading of ln v and ln PHI, a factor of 20 in v and PHI; standard deviations of the field
+MAX_LOG_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
+# of a step: where its bend is taken; bends that are none; the largest that is followed
+ACCELERATION_STEP, MIN_ACCELERATION, MAX_ACCELERATION = 0.1, 0.1, 0.75
+STALLED_GAIN_SHARE = 0.1  # share of the gain expected by the score below which readings are weighted otherwise
 CONVERGED = 0.1  # standard errors: how far the maximum may still be, by the gradient
-TOLD = 2.0  # standard errors from the maximum to which a fit is moved for a run that it did not know: 2 in log likelihood
-CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
-SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
+# standard errors from the maximum to which a fit is moved for a run that it did not know: 2 in log likelihood
+PREDICTION_TOLERANCE = 2.0
+INTERVAL_TOLERANCE = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
+# standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
+PORTMANTEAU_LIMIT = 2.5
 LAGS = 5  # of that statistic
-SAME_RATE = 0.25  # in the logarithm of the sampling interval, within which a gauge's noise is the same
-DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
-COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
-PERIODOGRAM = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
-SURVEYS = 3  # of all lines of the tables of critical loads at a maximum, and fits from where that finds nearer crossings
+MAX_DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
+COLOUR_SHARES = (0.5, 0.97)  # of the noise's variance, where colour begins
+PERIODOGRAM_SAMPLES = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
+MAX_SURVEYS = 3  # of all lines of the tables of critical loads at a maximum, and fits from where that finds nearer crossings
 START_DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
 
@@ -117,7 +122,7 @@ class Filtered:
     def of(self, signal: int) -> Innovations:
         """Return innovations (n,), variances and derivatives of one signal, and what was kept where its readings are."""
         f, k, c = self.every, len(self.run.signals), slice(signal, None, len(self.run.signals))
-        kept = f.kept and Kept(*(x[c] for x in vars(f.kept).values()))
+        kept = f.kept and SmootherInput(*(x[c] for x in vars(f.kept).values()))
         return Innovations(f.nu[c], f.S[c], f.nu_d[c], f.S_d[c], (f.reached + k - 1 - signal) // k, f.steps, f.bounded, kept)
 
     @cached_property
@@ -225,11 +230,11 @@ def _readings(
         return Dual(np.stack([a.v for a in duals], axis=1).ravel(), np.stack([a.d for a in duals], axis=1).reshape(n * c, k))
 
     observed, used = (np.stack([getattr(s, name) for s in run.signals], axis=1).ravel() for name in ("observed", "used"))
-    numbers, rate = np.tile(np.arange(c, dtype=np.intc), n), np.repeat(run.sampling.at, c)
-    rounding, level = np.array([s.quantum**2 / 12 for s in run.signals]), numbers * len(run.sampling.spacings) + rate
-    R = Dual((white.v**2)[level] + rounding[numbers], (2 * white.v[:, None] * white.d)[level])
+    signal_indices, rate = np.tile(np.arange(c, dtype=np.intc), n), np.repeat(run.sampling.at, c)
+    rounding, level = np.array([s.quantum**2 / 12 for s in run.signals]), signal_indices * len(run.sampling.spacings) + rate
+    R = Dual((white.v**2)[level] + rounding[signal_indices], (2 * white.v[:, None] * white.d)[level])
     return Readings(
-        np.repeat(run.t, c), observed, used, numbers, rate, np.tile(np.array(shows, dtype=np.intc), n), np.tile(weighs, n),
+        np.repeat(run.t, c), observed, used, signal_indices, rate, np.tile(np.array(shows, dtype=np.intc), n), np.tile(weighs, n),
         woven(factors), woven(offsets), R,
     )  # fmt: skip
 
@@ -264,7 +269,7 @@ def filter_run(
     for j, name in enumerate(by):
         if name in model.names:
             d[model.index(name), j] = share if name == "K" else 1.0
-    start, P0 = _belief(model, run, p, values, by, share)
+    start, P0 = _initial_state_distribution(model, run, p, values, by, share)
     gauges = gauges or [{n: n for n in values if n.startswith("gauge_")}] * (rates * c)
     rows = gauge_rows(processes_in(gauges[0]))
     K = Dual(p[[model.index("K")]], d[[model.index("K")]])
@@ -309,7 +314,7 @@ def _dual(names: Sequence[str], values: Mapping[str, float], by: Sequence[str]) 
     return Dual(np.array([values[n] if n else 0.0 for n in names]), d.reshape(len(names), len(by)))
 
 
-def _belief(
+def _initial_state_distribution(
     model: GeneratedModel, run: Run, p: Array, values: Mapping[str, float], by: Sequence[str], share: float
 ) -> tuple[Dual, Dual]:
     """Return mean (n,) and covariance (n, n) of the state at the first sample, where the field is what it is anywhere."""
@@ -401,7 +406,7 @@ class Likelihood:
         kinds: Sequence[Kind] = (),
     ) -> None:
         self.problem, self.smooth, self.processes = problem, smooth or not problem.runs, tuple(processes)
-        self.base_rtol, self.rtol = rtol, FREE_RUNNING * rtol if smooth else rtol
+        self.base_rtol, self.rtol = rtol, FREE_RUNNING_RTOL_FACTOR * rtol if smooth else rtol
         self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs) if problem.runs else {}
@@ -486,10 +491,10 @@ class Likelihood:
 
         Of one `signal` alone, where its number is given. A run that was held out has those of what was sampled most alike.
         """
-        found, rates = [self.gauge_names(self.kind_like(kind)) for kind in self.kinds_of(run)], len(run.sampling.spacings)
+        found, rates = [self.gauge_names(self.nearest_kind(kind)) for kind in self.kinds_of(run)], len(run.sampling.spacings)
         return found if signal is None else found[signal * rates : (signal + 1) * rates]
 
-    def kind_like(self, kind: Kind) -> Kind:
+    def nearest_kind(self, kind: Kind) -> Kind:
         """Return which of the kinds of gauge noise here is most like this one."""
         near = [known for known in self.kinds if known[0] == kind[0]] or self.kinds
         near = [known for known in near if known[2] == kind[2]] or near
@@ -508,7 +513,7 @@ class Likelihood:
             for n in self.names
             if n in own or (n not in others and ("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
         }
-        for farthest in (np.inf, FARTHEST_UPDATE):  # held back where it cannot be followed otherwise
+        for farthest in (np.inf, MAX_UPDATE):  # held back where it cannot be followed otherwise
             found = filter_run(
                 problem.model, problem.experiment, run, problem.local(run, values), by=tuple(by.values()) if slopes else (),
                 gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
@@ -523,22 +528,22 @@ class Likelihood:
 
         So is what varies, if no run that was fitted is of its group.
         """
-        own = own_names(self.problem.model, run, self.problem.trend)
-        if not own and not self.noisy_alone(run) and values.keys() >= {*self.problem.varied(run).values()}:
+        own = run_specific_names(self.problem.model, run, self.problem.trend)
+        if not own and not self.has_own_noise(run) and values.keys() >= {*self.problem.varied(run).values()}:
             return self.filtered(run, values)
-        return replace(self.alone(run, values)[1].runs[0], run=run)
+        return replace(self.single_run_maximum(run, values)[1].runs[0], run=run)
 
-    def noisy_alone(self, run: Run) -> bool:
+    def has_own_noise(self, run: Run) -> bool:
         """Return whether no run that was fitted has this one's gauge noise: none of its group, or none sampled about as often."""
         return not all(any(_same_noise(kind, known) for known in self.kinds) for kind in self.kinds_of(run))
 
-    def alone(self, run: Run, values: Mapping[str, float]) -> tuple[Likelihood, Point]:
+    def single_run_maximum(self, run: Run, values: Mapping[str, float]) -> tuple[Likelihood, Point]:
         """Return the likelihood of a run that was not fitted, by what belongs to it alone, and its maximum."""
         problem = self.problem
-        own = own_names(problem.model, run, problem.trend)
+        own = run_specific_names(problem.model, run, problem.trend)
         varying = {name: n for n, name in problem.varied(run).items() if name not in values}
         p = run_parameters(problem.model, problem.experiment, run, values)
-        rows = [own_start(problem.model, run, p, n, problem.trend) for n in own]
+        rows = [run_specific_start(problem.model, run, p, n, problem.trend) for n in own]
         listed = {q.name: q for q in problem.experiment.parameters}
         for name, n in varying.items():
             others = [values[other] for other in {names[n] for names in problem.varying.values()} if other in values]
@@ -546,34 +551,34 @@ class Likelihood:
             own.append(name)
         start, lower, upper = np.array(rows).reshape(-1, 3).T
         of_group = set(problem.varied(run).values()) - set(own)
-        held = {n: values[n] for n in (*problem.held, *problem.names) if "." not in n or n in of_group}
+        held = {n: values[n] for n in (*problem.fixed_values, *problem.names) if "." not in n or n in of_group}
         alone = replace(
-            problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held,
-            priors=(), tables=(),
+            problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper,
+            fixed_values=held, priors=(), tables=(),
         )  # fmt: skip
         likelihood = self.beside(alone)
         known = {n: values[n] for n in FIELD}
         for alone_names, names in zip(likelihood.gauges(alone.runs[0]), self.gauges(run), strict=True):
             known |= {name: values[names[local]] for local, name in alone_names.items()}
         x = likelihood.coordinates(known)
-        gauge = [n for n in likelihood.names if n not in (*own, *FIELD)] if self.noisy_alone(run) else []
-        return likelihood, maximise(likelihood, x, held=[n for n in likelihood.names if n not in (*own, *gauge)]).point
+        gauge = [n for n in likelihood.names if n not in (*own, *FIELD)] if self.has_own_noise(run) else []
+        return likelihood, maximise(likelihood, x, fixed=[n for n in likelihood.names if n not in (*own, *gauge)]).point
 
-    def pieces(self, point: Point) -> Iterator[tuple[Array, Array, Kind]]:
+    def innovations_by_kind(self, point: Point) -> Iterator[tuple[Array, Array, Kind]]:
         """Yield standardised innovations, their log densities, kinds of gauge noise, of each signal at each of its rates."""
         for f in point.runs:
             rates, at = len(f.run.sampling.spacings), f.run.sampling.at
             kind = np.concatenate([i * rates + at[s.used] for i, s in enumerate(f.run.signals)])
             white, density = f.white, f.log_density
             for k, own in enumerate(self.kinds_of(f.run)):
-                yield white[kind == k], density[kind == k], self.kind_like(own)
+                yield white[kind == k], density[kind == k], self.nearest_kind(own)
 
     def by_kind(self, point: Point) -> list[float]:
         """Return what each kind of gauge noise has of the log likelihood."""
         if not np.isfinite(point.log_likelihood):
             return [-np.inf] * len(self.kinds)
         total = dict.fromkeys(self.kinds, 0.0)
-        for _, density, kind in self.pieces(point):
+        for _, density, kind in self.innovations_by_kind(point):
             total[kind] += float(np.sum(density))
         return list(total.values())
 
@@ -586,7 +591,7 @@ class Likelihood:
             return list(pool.map(work, self.problem.runs))
 
     def at(self, x: Array, *, slopes: bool = True, keep: bool = False, like: Point | None = None, anew: bool = False) -> Point:
-        """Return log likelihood, score and information at x (k,); -inf where a run takes MOST_WORK times the steps of `like`.
+        """Return log likelihood, score and information at x (k,); -inf if a run takes MAX_WORK_RATIO times the steps of `like`.
 
         With `anew` every line of the tables is searched in full.
         """
@@ -594,7 +599,7 @@ class Likelihood:
             return self.best
         values, k = self.values(x), len(self.names)
         self.evaluations += 1
-        most, failed = {f.run.name: MOST_WORK * f.found.steps for f in like.runs} if like else {}, False
+        most, failed = {f.run.name: MAX_WORK_RATIO * f.found.steps for f in like.runs} if like else {}, False
 
         def one(run: Run) -> Filtered:
             nonlocal failed  # then the others are not needed
@@ -611,13 +616,13 @@ class Likelihood:
         score, information = np.zeros(k), np.zeros((k, k))
         unit = self.unit(x)
         for names, scatter in self.problem.priors:  # of values about a mean that is unknown
-            places = [self.names.index(n) for n in names]
+            indices = [self.names.index(n) for n in names]
             off = np.array([values[n] for n in names])
             off = (off - off.mean()) / scatter**2
             total -= 0.5 * scatter**2 * float(off @ off)
-            score[places] -= off * unit[places]
+            score[indices] -= off * unit[indices]
             centred = np.eye(off.size) - 1 / off.size
-            information[np.ix_(places, places)] += centred / scatter**2 * np.outer(unit[places], unit[places])
+            information[np.ix_(indices, indices)] += centred / scatter**2 * np.outer(unit[indices], unit[indices])
         if slopes and np.isfinite(total):
             for t in tables:
                 score += t.score * unit
@@ -648,13 +653,13 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
     longest = max(float(r.t[-1] - r.t[0]) for r in runs)
     length = max(slid, 1e-6) / LENGTHS_IN_SLIP
     found: dict[Any, tuple[float, float, float]] = {
-        "field_amplitude": (WIDE[0][0] * friction, LEAST_FIELD * friction, 0.3 * friction),
+        "field_amplitude": (WIDE_FIELDS[0][0] * friction, LEAST_FIELD * friction, 0.3 * friction),
         "field_length": (length, length / 100, 10 * length),
     }
     for what in {s.observable for r in runs for s in r.signals}:
         own = [(r.t, s) for r in runs for s in r.signals if s.observable == what]
-        level = float(np.median([first_level(*each) for each in own]))
-        quiet = min([level, *(max(_floor(*each), 1e-3 * level) for each in own)])
+        level = float(np.median([white_noise_level(*each) for each in own]))
+        quiet = min([level, *(max(_calm_noise_level(*each), 1e-3 * level) for each in own)])
         found |= {
             ("gauge_white", what): (level, quiet / 30, 100 * level),
             ("gauge_colour", what): (level, quiet / 100, 100 * level),
@@ -665,7 +670,7 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
     return found
 
 
-def _floor(t: Array, signal: Signal) -> float:
+def _calm_noise_level(t: Array, signal: Signal) -> float:
     """Return the white noise of a signal at the times t (n,), however large its corners and jumps are, and its rounding."""
     a, b = max(stretches(t, signal.used), key=lambda part: part[1] - part[0])
     return float(np.hypot(calm_level(signal.observed[a:b]), signal.quantum / np.sqrt(12)))
@@ -676,7 +681,7 @@ def _spacings(run: Run) -> list[float]:
     return [float(f"{dt:.2g}") for dt in run.sampling.spacings]
 
 
-def first_level(t: Array, signal: Signal) -> float:
+def white_noise_level(t: Array, signal: Signal) -> float:
     """Return the standard deviation of white noise that the readings of a signal at the times t (n,) show themselves."""
     level = difference_level(signal.observed, stretches(t, signal.used))
     return max(level, signal.quantum / np.sqrt(12), 1e-9 * float(np.ptp(signal.observed)), 1e-300)
@@ -704,23 +709,24 @@ class Maximum:
     def expected(self) -> float:
         """Return the log likelihood expected at the maximum; that of the point where scoring had yet to weigh all alike.
 
-        Of recordings it is expected HOPELESS above the point at most: from farther off the score tells nothing of the maximum.
+        Of recordings it is expected PRUNING_DEFICIT above the point at most: from farther off the score tells nothing of the
+        maximum.
         """
         gain = 0.5 * self.away**2 if np.isfinite(self.away) else 0.0
-        return self.point.log_likelihood + (min(gain, HOPELESS) if self.point.runs else gain)
+        return self.point.log_likelihood + (min(gain, PRUNING_DEFICIT) if self.point.runs else gain)
 
 
 def maximise(
     likelihood: Likelihood,
     x: Array,
     *,
-    held: Sequence[str] = (),
+    fixed: Sequence[str] = (),
     steps: int = SCORING_STEPS,
     close: float = CONVERGED,
     widths: Sequence[float] | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Maximum:
-    """Return the maximum from x (k,), by Fisher scoring with Levenberg's damping; parameters `held` stay where they are.
+    """Return the maximum from x (k,), by Fisher scoring with Levenberg's damping; parameters in `fixed` stay where they are.
 
     Readings and critical loads are weighted first, by how far each tells something, `widths` one after the other (WIDTHS), and
     then all count alike, from where the weights led or, if that is likelier, from a point that was passed on the way.
@@ -728,7 +734,7 @@ def maximise(
     of what that distance is worth. Parameters that a step would push out stay at their
     bounds. A likelihood that cannot be evaluated at x is a status.
     """
-    free = np.array([n not in held for n in likelihood.names])
+    free = np.array([n not in fixed for n in likelihood.names])
     point, damping = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper)), 1e-3
     if not np.isfinite(point.log_likelihood):
         return Maximum(point, np.inf, Status.INTEGRATION, np.full((x.size, x.size), np.nan))
@@ -743,18 +749,18 @@ def maximise(
             score, information = point.score, point.information
             weights: list[Array] = []
             if width:
-                score, information, weights = _weighted(likelihood, point, width, free)
+                score, information, weights = _weighted_score(likelihood, point, width, free)
             moving = np.nonzero(free & ~(low & (score < 0)) & ~(high & (score > 0)))[0]
             g, I = score[moving], (information + more)[np.ix_(moving, moving)]
             d, size, directions = _scaled(I)
             steep = directions.T @ (g / d)
-            felt = np.diag(I) * (likelihood.upper - likelihood.lower)[moving] ** 2 > UNFELT
+            felt = np.diag(I) * (likelihood.upper - likelihood.lower)[moving] ** 2 > MIN_SENSITIVITY
             wide, power, ways = (d, size, directions) if felt.all() else _scaled(I[np.ix_(felt, felt)])
             away = float(np.sqrt(np.sum((ways.T @ (g[felt] / wide)) ** 2 / power)))
             if not width or (away > np.sqrt(moving.size) and slow < 2):  # farther than chance would have it
                 break
             left, slow, damping = left[1:], 0, 1e-3
-        if not width and best.log_likelihood > point.log_likelihood + away**2 / 2 + NEEDED:  # weights led astray
+        if not width and best.log_likelihood > point.log_likelihood + away**2 / 2 + SIGNIFICANT_GAIN:  # weights led astray
             progress(f"log likelihood {point.log_likelihood:.1f}, where {best.log_likelihood:.1f} was passed")
             point = best
             continue
@@ -766,11 +772,15 @@ def maximise(
         while damping < 1e8:
             move = directions @ (steep / (size + damping)) / d
             if winding and not width:
-                bend = directions @ ((directions.T @ (_pull(likelihood, point, moving, move) / d)) / (size + damping)) / d
+                bend = (
+                    directions
+                    @ ((directions.T @ (_acceleration_score(likelihood, point, moving, move) / d)) / (size + damping))
+                    / d
+                )
                 turn = 2 * float(np.linalg.norm(bend * d) / np.linalg.norm(move * d))
-                winding, part = turn > STRAIGHT, min(TURN / max(turn, TURN), 1.0)
+                winding, part = turn > MIN_ACCELERATION, min(MAX_ACCELERATION / max(turn, MAX_ACCELERATION), 1.0)
                 move = part * move + part**2 * bend / 2
-            move = np.where(likelihood.logarithmic[moving], np.clip(move, -FARTHEST_STEP, FARTHEST_STEP), move)
+            move = np.where(likelihood.logarithmic[moving], np.clip(move, -MAX_LOG_STEP, MAX_LOG_STEP), move)
             x = point.x.copy()
             x[moving] += move
             trial = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper), slopes=sure, like=point)
@@ -782,14 +792,14 @@ def maximise(
                 share = gain / max(float(g @ move - 0.5 * move @ I @ move), 1e-300)  # of what its quadratic model expects
                 damping = max(damping * (0.1 if share > 0.5 else 1.0 if share > 0.25 else 2.0), 1e-9)
                 last, point, sure = point, trial, share > 0.25
-                more = more if width else _curvature_beyond(last, point)
+                more = more if width else _sr1_correction(last, point)
                 winding = winding or share < 0.5
                 if not width and gain < 1.0:
-                    point = _farther(likelihood, trial, trail)
+                    point = _pattern_move(likelihood, trial, trail)
                     gain += point.log_likelihood - trial.log_likelihood
                 trail = [*trail[-1:], point.x]
                 best = max(best, point, key=lambda p: p.log_likelihood)
-                slow = slow + 1 if gain < (max(1.0, CREEP * away**2 / 2) if width else close**2 / 8) else 0
+                slow = slow + 1 if gain < (max(1.0, STALLED_GAIN_SHARE * away**2 / 2) if width else close**2 / 8) else 0
                 break
             sure = False  # what may fail is tried without derivatives: a quarter of the work
             if not felt.all():  # next without what changes nothing here, whose steps may lead anywhere
@@ -815,10 +825,10 @@ def _scaled(information: Array) -> tuple[Array, Array, Array]:
     """Return the roots d (m,) of an information's diagonal, and its eigenvalues (p,) and directions (m, p) over these."""
     d = np.sqrt(np.maximum(np.diag(information), 1e-300))
     size, directions = np.linalg.eigh(information / np.outer(d, d))
-    return d, size[size > FLAT], directions[:, size > FLAT]
+    return d, size[size > MIN_EIGENVALUE], directions[:, size > MIN_EIGENVALUE]
 
 
-def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Point:
+def _pattern_move(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Point:
     """Return the likeliest point on the way from the last but one of the points before, 2, 4, 8 times as far; else the point.
 
     Steps that go to and fro across a ridge lead along it two by two: the pattern move of Hooke and Jeeves, J. ACM 8 (1961).
@@ -836,7 +846,7 @@ def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Po
     return farthest if farthest.log_likelihood > point.log_likelihood else point
 
 
-def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -> tuple[Array, Array, list[Array]]:
+def _weighted_score(likelihood: Likelihood, point: Point, width: float, free: Array) -> tuple[Array, Array, list[Array]]:
     """Return score and information with a weight (m,) for each reading, and the weights by run: those of effective variances.
 
     Each parameter that is `free` (k,) is taken to be uncertain by the share `width` of itself, or by WIDEST_ERRORS times
@@ -868,7 +878,7 @@ def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -
     return score, information, weights
 
 
-def _pull(likelihood: Likelihood, point: Point, moving: Array, move: Array) -> Array:
+def _acceleration_score(likelihood: Likelihood, point: Point, moving: Array, move: Array) -> Array:
     """Return what the second derivatives of all innovations along a step (m,) do to the score (m,); zeros where it leads astray.
 
     By one likelihood without derivatives. Half of the step that this makes, added, follows a ridge that bends, which straight
@@ -876,9 +886,9 @@ def _pull(likelihood: Likelihood, point: Point, moving: Array, move: Array) -> A
     """
     total, along = np.zeros((2, len(likelihood.names)))
     along[moving] = move
-    if np.any(BEND_AT * np.abs(along[likelihood.logarithmic]) > FARTHEST_STEP):
+    if np.any(ACCELERATION_STEP * np.abs(along[likelihood.logarithmic]) > MAX_LOG_STEP):
         return total[moving]
-    probe = likelihood.at(point.x + BEND_AT * along, slopes=False, like=point)
+    probe = likelihood.at(point.x + ACCELERATION_STEP * along, slopes=False, like=point)
     if not np.isfinite(probe.log_likelihood):
         return total[moving]
     moved: list[tuple[Array, Array | float]] = []
@@ -887,7 +897,7 @@ def _pull(likelihood: Likelihood, point: Point, moving: Array, move: Array) -> A
         moved.append(((g.every.nu - f.every.nu)[f.used] / np.sqrt(S), np.log(g.every.S[f.used] / S)))
     moved += [(u.white - t.white, 0.0) for t, u in zip(point.tables, probe.tables, strict=True)]
     for (at, a, b), (first, second) in zip(_slopes(likelihood, point), moved, strict=True):
-        bends = [2 / BEND_AT * (m / BEND_AT - slope @ along[at]) for m, slope in ((first, a), (second, b))]
+        bends = [2 / ACCELERATION_STEP * (m / ACCELERATION_STEP - slope @ along[at]) for m, slope in ((first, a), (second, b))]
         total[at] -= bends[0] @ a + 0.5 * bends[1] @ b  # weights as in the information
     return total[moving]
 
@@ -916,7 +926,7 @@ def _gain(trial: Point, point: Point, weights: Sequence[Array]) -> float:
     return float(sum(w @ (new - old) for w, new, old in zip(weights, after, before, strict=True)))
 
 
-def _curvature_beyond(last: Point, point: Point) -> Array:
+def _sr1_correction(last: Point, point: Point) -> Array:
     """Return what the curvature along the last step has beyond the information (k, k), by the change of the score (SR1).
 
     Scoring by the information alone overshoots there, to and fro. A smaller curvature is left alone: it makes no step too long.
@@ -950,7 +960,7 @@ class StateSpaceFit:
     likelihood: Likelihood
     maximum: Maximum
     evaluations: int = 0  # 0 while it is being sought
-    _told: dict[str, tuple[Run, Predictive]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _predicted: dict[str, tuple[Run, Predictive]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def smooth(self) -> bool:
@@ -979,16 +989,16 @@ class StateSpaceFit:
         By Laplace's method: p(new | old) = p(new, old) / p(old), of a fit to both and of this one. `sizes` are as in
         `log_evidence`. Each run is predicted once.
         """
-        known = self._told.get(run.name)
+        known = self._predicted.get(run.name)
         if known is None or known[0] is not run:
-            known = self._told[run.name] = (run, self._predictive(run, sizes))
+            known = self._predicted[run.name] = (run, self._predictive(run, sizes))
         return known[1]
 
     def _predictive(self, run: Run, sizes: Mapping[str, tuple[float, float]] | None) -> Predictive:
-        both, start = self._with(run)
-        maximum = maximise(both, both.coordinates(start), close=TOLD)
+        both, start = self._joined_with(run)
+        maximum = maximise(both, both.coordinates(start), close=PREDICTION_TOLERANCE)
         if both.best is not None and both.best.log_likelihood > maximum.point.log_likelihood:
-            maximum = maximise(both, both.best.x, close=TOLD, widths=())
+            maximum = maximise(both, both.best.x, close=PREDICTION_TOLERANCE, widths=())
         point = maximum.point
         *_, last = point.runs
         fit = StateSpaceFit(both, replace(maximum, point=replace(point, runs=(last,))))
@@ -997,17 +1007,17 @@ class StateSpaceFit:
             return Predictive(-np.inf, np.inf, fit)
         moved = self.log_likelihood - (point.log_likelihood - last.log_likelihood)  # of what was fitted
         total = log_evidence(StateSpaceFit(both, maximum), sizes) - log_evidence(self, sizes)
-        total += _unfinished(maximum) - _unfinished(self.maximum)
+        total += _remaining_gain(maximum) - _remaining_gain(self.maximum)
         total += min(moved, 0.0)  # that the others have a higher maximum is nothing that was predicted
         rms = float(np.sqrt((last.white @ last.white + 2 * max(moved, 0.0)) / last.white.size))
         return Predictive(total, rms, fit)
 
-    def _with(self, run: Run) -> tuple[Likelihood, dict[str, float]]:
+    def _joined_with(self, run: Run) -> tuple[Likelihood, dict[str, float]]:
         """Return the likelihood of the runs that were fitted and of another, which comes last, and where it is maximised from.
 
         What is known has the same bounds, so that priors are the same.
         """
-        own, (alone, point) = self.likelihood, self.likelihood.alone(run, self.values)
+        own, (alone, point) = self.likelihood, self.likelihood.single_run_maximum(run, self.values)
         before, after = own.problem, alone.problem
         joined = replace(
             before, runs=(*before.runs, *after.runs), names=(*before.names, *after.names),
@@ -1068,9 +1078,9 @@ def _log_prior(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | 
     return np.asarray(density)
 
 
-def _unfinished(maximum: Maximum) -> float:
-    """Return what the log likelihood still gains where scoring ended within TOLD standard errors of its maximum."""
-    return 0.5 * maximum.away**2 if maximum.away < TOLD else 0.0
+def _remaining_gain(maximum: Maximum) -> float:
+    """Return what the log likelihood still gains if scoring ended within PREDICTION_TOLERANCE of its maximum."""
+    return 0.5 * maximum.away**2 if maximum.away < PREDICTION_TOLERANCE else 0.0
 
 
 class Interrupted(Exception):
@@ -1106,9 +1116,10 @@ def fit_state_space(
     of coloured noise the gauge has, words of PROCESSES; left out, Schwarz's criterion decides, early and, if the fit is to be
     `thorough`, again at the maximum; where it is `cautious`, more than one only if innovations are correlated all along, as those
     of a model that lacks something are not. `beside` says whether maxima next to that found are looked for
-    (`likeliest_beside`). What stays below `least` in log likelihood is not finished. The status is that of the last maximisation.
+    (`likeliest_along_ridges`). What stays below `least` in log likelihood is not finished. The status is that of the last
+    maximisation.
     """
-    fit = _FitUnderWay(problem, smooth, processes, cautious, close, rtol, progress)
+    fit = _FitProcedure(problem, smooth, processes, cautious, close, rtol, progress)
     try:
         if part is None and start is None and (runs := thinned(problem.runs, many)) is not problem.runs:
             part = fit_state_space(
@@ -1146,7 +1157,7 @@ def _surveyed(found: StateSpaceFit, close: float, progress: Callable[[str], None
     own, maximum = found.likelihood, found.maximum
     if maximum.status is Status.INTEGRATION:
         return found
-    for _ in range(SURVEYS):
+    for _ in range(MAX_SURVEYS):
         point = own.at(maximum.point.x, anew=True)
         if abs(point.log_likelihood - maximum.point.log_likelihood) < close**2 / 2:
             maximum = replace(maximum, point=point)
@@ -1156,11 +1167,11 @@ def _surveyed(found: StateSpaceFit, close: float, progress: Callable[[str], None
     return StateSpaceFit(own, maximum)
 
 
-def stopped(problem: Problem, found: StateSpaceFit | None) -> StateSpaceFit:
+def interrupted_fit(problem: Problem, found: StateSpaceFit | None) -> StateSpaceFit:
     """Return the state of a fit that was stopped: its parameters, with errors as if they were the maximum."""
     smooth, processes = (found.smooth, found.likelihood.processes) if found else (True, ())
     likelihood = Likelihood(problem, smooth=smooth, processes=processes)
-    point = likelihood.at(likelihood.coordinates(_carried(found, likelihood) if found else {}))
+    point = likelihood.at(likelihood.coordinates(_values_for(found, likelihood) if found else {}))
     return StateSpaceFit(likelihood, Maximum(point, np.inf, Status.INTERRUPTED, inverse(point.information)), 1)
 
 
@@ -1171,17 +1182,17 @@ def thinned(runs: tuple[Run, ...], many: int = MANY_READINGS) -> tuple[Run, ...]
     return tuple(run.thinned(-(-run.t.size * len(runs) // many)) for run in runs)
 
 
-def _carried(found: StateSpaceFit, likelihood: Likelihood) -> dict[str, float]:
+def _values_for(found: StateSpaceFit, likelihood: Likelihood) -> dict[str, float]:
     """Return the values of a fit, by name, with those of its gauge noise under the names that another likelihood has."""
     values, own = dict(found.values), found.likelihood
     for kind in likelihood.kinds:
-        known = own.gauge_names(own.kind_like(kind))
+        known = own.gauge_names(own.nearest_kind(kind))
         values |= {name: values[known[n]] for n, name in likelihood.gauge_names(kind).items() if n in known}
     return values
 
 
 @dataclass(frozen=True)
-class _FitUnderWay:
+class _FitProcedure:
     """The steps of `fit_state_space`, whose arguments hold for all of them; `tried` are the likelihoods so far."""
 
     problem: Problem
@@ -1205,7 +1216,7 @@ class _FitUnderWay:
     def on_all(self, part: StateSpaceFit) -> StateSpaceFit:
         """Return the fit to all readings from that to a part of them; a small field and further colours may show in all alone."""
         whole = self.likelihood(part.smooth, part.likelihood.processes)
-        best = self.maximised(whole, whole.coordinates(_carried(part, whole)))
+        best = self.maximised(whole, whole.coordinates(_values_for(part, whole)))
         if self.processes is None:
             best = self.with_colour(best)
         if self.smooth is None and best.smooth:
@@ -1218,9 +1229,11 @@ class _FitUnderWay:
         smooth, processes, close, progress = self.smooth, self.processes, self.close, self.progress
         wide, fresh = self.likelihood(False, processes or ()), "field_amplitude" not in start
         steps = SCORING_STEPS // 2 if fresh else 12
-        found = from_any(wide, wide_starts(wide, start, progress), steps, progress)
+        found = maximise_from_starts(wide, wide_starts(wide, start, progress), steps, progress)
         if found is None or (fresh and found.status is Status.INTEGRATION):
-            found = from_any(wide, multi_start(wide, wide.coordinates(start), progress)[: len(WIDE)], steps, progress)
+            found = maximise_from_starts(
+                wide, multi_start(wide, wide.coordinates(start), progress)[: len(WIDE_FIELDS)], steps, progress
+            )
         assert found is not None
         if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
             found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
@@ -1240,7 +1253,7 @@ class _FitUnderWay:
             return best
         best = self.with_or_without(best)
         if thorough and processes is None:
-            moved = best.smooth or best.log_likelihood > first.log_likelihood + NEEDED
+            moved = best.smooth or best.log_likelihood > first.log_likelihood + SIGNIFICANT_GAIN
             wider = self.with_colour(best) if moved else best
             grown = len(wider.likelihood.processes) > len(best.likelihood.processes)
             best = self.with_or_without(wider) if grown else wider
@@ -1254,7 +1267,7 @@ class _FitUnderWay:
                     x = np.concatenate([instead.coordinates(start)[:k], other.maximum.point.x[k:]])
                     anew = maximise(instead, x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
                     other = max(other, StateSpaceFit(instead, anew), key=lambda f: f.log_likelihood)
-                if other.criterion > best.criterion - CLOSE_CALL:
+                if other.criterion > best.criterion - EARLY_STOP_DEFICIT:
                     other = self.maximised(instead, other.maximum.point.x)
                 if other.criterion > best.criterion:  # beside the colour there may be another, smaller field
                     best = self.beside_small_field(other)
@@ -1262,12 +1275,12 @@ class _FitUnderWay:
         widest = wide.values(wide.start)["field_amplitude"]  # which may stand for colour, and for falls that come as a surprise
         if fresh and processes is None and best.maximum.point.surprising and best.values["field_amplitude"] > widest:
             coloured = self.likelihood(False, best.likelihood.processes or ("relaxation",))
-            another = from_any(coloured, wide_starts(coloured, start, progress), steps, progress)
+            another = maximise_from_starts(coloured, wide_starts(coloured, start, progress), steps, progress)
             if another and another.expected > best.log_likelihood:
                 other = self.maximised(coloured, another.point.x)
                 best = max(best, self.with_or_without(other), key=lambda f: f.criterion)
         if fresh:
-            best = likeliest_beside(best, close, progress) if beside else best
+            best = likeliest_along_ridges(best, close, progress) if beside else best
         if fresh and smooth is None and best.smooth:
             best = _with_faint_fields(best, self.likelihood(False, best.likelihood.processes))
         return best
@@ -1279,7 +1292,7 @@ class _FitUnderWay:
         what the physics lack leaves a few. No more are tried where as many as there may be, each with the gain of the last, would
         leave the log likelihood below `least`.
         """
-        while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > DEVIATION:
+        while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > MAX_DEVIATION:
             if self.cautious and known and not steadily_coloured(best, self.cautious):
                 break
             found = best
@@ -1297,12 +1310,12 @@ class _FitUnderWay:
 
     def with_or_without(self, begun: StateSpaceFit) -> StateSpaceFit:
         """Return the fit from where one begun stands, with a field or without, as `smooth` says or the likelihood."""
-        rough, smooth, close, progress = begun.likelihood, self.smooth, self.close, self.progress
-        if rough.smooth:
-            return self.maximised(rough, begun.maximum.point.x)
-        plain = self.likelihood(True, rough.processes)
-        at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
-        faint = _amplitude(rough, FAINT_FIELD)
+        field_likelihood, smooth, close, progress = begun.likelihood, self.smooth, self.close, self.progress
+        if field_likelihood.smooth:
+            return self.maximised(field_likelihood, begun.maximum.point.x)
+        plain = self.likelihood(True, field_likelihood.processes)
+        at, before, found = field_likelihood.names.index("field_amplitude"), field_likelihood.evaluations, begun.maximum
+        faint = _amplitude(field_likelihood, FAINT_FIELD)
 
         def without_field(steps: int) -> StateSpaceFit:
             progress("without a field")
@@ -1310,38 +1323,38 @@ class _FitUnderWay:
 
         tried: StateSpaceFit | None = None
         if not np.isfinite(found.away):
-            found = maximise(rough, found.point.x, close=close, progress=progress)
+            found = maximise(field_likelihood, found.point.x, close=close, progress=progress)
         elsewhere = False  # a field finer than the samples, or one that is slow, may be a maximum of its own
-        while rough.evaluations - before < SCORING_STEPS:
+        while field_likelihood.evaluations - before < SCORING_STEPS:
             last = found.point.x
-            found = maximise(rough, last, steps=3, close=close, widths=(), progress=progress)
+            found = maximise(field_likelihood, last, steps=3, close=close, widths=(), progress=progress)
             if found.away < close or np.array_equal(found.point.x, last):
-                other = None if elsewhere else _small_field(rough, found.point)
+                other = None if elsewhere else _small_field(field_likelihood, found.point)
                 if other is None:
                     break
                 elsewhere, found = True, replace(found, point=other)
                 continue
             if found.point.x[at] < last[at] - FIELD_SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
-                found = replace(found, point=_shrunk(rough, found.point, at))
+                found = replace(found, point=_shrunk(field_likelihood, found.point, at))
             if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
                 tried = without_field(TRIAL_STEPS)
                 if tried.log_likelihood > found.point.log_likelihood and tried.maximum.away < close:
-                    small = _small_field(rough, tried.maximum.point)
+                    small = _small_field(field_likelihood, tried.maximum.point)
                     if small is None:
                         return tried
                     found = replace(found, point=small)
         if found.away >= close:  # a longer run knows the curvature of its last step, by which scoring alone goes to and fro
-            found = maximise(rough, found.point.x, close=close, widths=(), progress=progress)
-        best = StateSpaceFit(rough, found)
+            found = maximise(field_likelihood, found.point.x, close=close, widths=(), progress=progress)
+        best = StateSpaceFit(field_likelihood, found)
         if smooth is False:
             return best
         if tried is None:
             there = plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood
-            if smooth or there > found.point.log_likelihood - HOPELESS:
+            if smooth or there > found.point.log_likelihood - PRUNING_DEFICIT:
                 tried = without_field(SCORING_STEPS)
             elif found.point.x[at] < faint:  # an oscillation is integrated more closely: its narrow maximum is next to this
                 tried = without_field(TRIAL_STEPS)
-        if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
+        if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - SIGNIFICANT_GAIN):
             return best
         if tried.maximum.away < close:
             return tried
@@ -1349,17 +1362,21 @@ class _FitUnderWay:
 
     def beside_small_field(self, fitted: StateSpaceFit) -> StateSpaceFit:
         """Return where a small field beside a fit without one leads, yet to be maximised; the fit where it gains too little."""
-        rough = self.likelihood(False, fitted.likelihood.processes)
-        small = _small_field(rough, fitted.maximum.point)
-        return fitted if small is None else StateSpaceFit(rough, replace(fitted.maximum, point=small))
+        field_likelihood = self.likelihood(False, fitted.likelihood.processes)
+        small = _small_field(field_likelihood, fitted.maximum.point)
+        return fitted if small is None else StateSpaceFit(field_likelihood, replace(fitted.maximum, point=small))
 
 
-def from_any(rough: Likelihood, starts: Iterable[Array], steps: int, progress: Callable[[str], None]) -> Maximum | None:
+def maximise_from_starts(
+    field_likelihood: Likelihood, starts: Iterable[Array], steps: int, progress: Callable[[str], None]
+) -> Maximum | None:
     """Return the maximum from the first start that leads near one, or the likeliest that was reached from all."""
-    return likeliest_end(rough, (maximise(rough, x, steps=steps, close=1.0, progress=progress) for x in starts))
+    return likeliest_end(
+        field_likelihood, (maximise(field_likelihood, x, steps=steps, close=1.0, progress=progress) for x in starts)
+    )
 
 
-def likeliest_end(rough: Likelihood, ends: Iterable[Maximum]) -> Maximum | None:
+def likeliest_end(field_likelihood: Likelihood, ends: Iterable[Maximum]) -> Maximum | None:
     """Return the first of several ends that is near a maximum under a faint field, or the likeliest of them.
 
     Under a field that does not become faint the filter follows the recordings whatever the parameters are: these may have drifted
@@ -1367,20 +1384,20 @@ def likeliest_end(rough: Likelihood, ends: Iterable[Maximum]) -> Maximum | None:
     """
     found: Maximum | None = None
     bounded = False
-    at = rough.names.index("field_amplitude")
-    faint = _amplitude(rough, FAINT_FIELD)
+    at = field_likelihood.names.index("field_amplitude")
+    faint = _amplitude(field_likelihood, FAINT_FIELD)
     for other in ends:
         if found is None or other.point.log_likelihood > found.point.log_likelihood:
             found = other
         y = other.point.x
-        inside = not rough.at_bounds(y)
+        inside = not field_likelihood.at_bounds(y)
         if other.away < NOT_CONVERGED and y[at] < faint and (inside or bounded):
             break
         bounded = bounded or not inside
     return found
 
 
-def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFit:
+def _with_faint_fields(fitted: StateSpaceFit, field_likelihood: Likelihood) -> StateSpaceFit:
     """Return a fit without a field, with what fields that are too faint to be told add to its covariance.
 
     Averaged over amplitudes, the prior even in their logarithm from LEAST_FIELD on, and over lengths, each with the posterior
@@ -1389,15 +1406,16 @@ def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFi
     """
     plain, maximum = fitted.likelihood, fitted.maximum
     inner = np.nonzero(np.diag(maximum.covariance) > 0)[0]
-    at = [rough.names.index(plain.names[i]) for i in inner]
-    start, logs = rough.coordinates(fitted.values), np.log(np.array(FAINT_FIELDS) * FAINT_FIELD / LEAST_FIELD)
-    prior = np.array([logs[0], *np.repeat(np.gradient(logs), len(SHORT)) / len(SHORT)])  # below the first it is as none
+    at = [field_likelihood.names.index(plain.names[i]) for i in inner]
+    start, logs = field_likelihood.coordinates(fitted.values), np.log(np.array(FAINT_FIELDS) * FAINT_FIELD / LEAST_FIELD)
+    # below the first it is as none
+    prior = np.array([logs[0], *np.repeat(np.gradient(logs), len(FAINT_FIELD_LENGTHS)) / len(FAINT_FIELD_LENGTHS)])
     evidence, moves, covariances = [_laplace(maximum.point, inner)[0]], [np.zeros(inner.size)], []
     covariances.append(maximum.covariance[np.ix_(inner, inner)])
-    for share, short in product(FAINT_FIELDS, SHORT):
-        x = _under_field(rough, start, share * FAINT_FIELD, short)
-        likely = rough.at(x, slopes=False).log_likelihood > fitted.log_likelihood - DOWN
-        point = rough.at(x, slopes=likely)
+    for share, short in product(FAINT_FIELDS, FAINT_FIELD_LENGTHS):
+        x = _under_field(field_likelihood, start, share * FAINT_FIELD, short)
+        likely = field_likelihood.at(x, slopes=False).log_likelihood > fitted.log_likelihood - FAINT_FIELD_DEFICIT
+        point = field_likelihood.at(x, slopes=likely)
         if not likely:
             point = replace(point, log_likelihood=-np.inf)
         height, move, covariance = _laplace(point, np.array(at))
@@ -1430,7 +1448,7 @@ def _short_field(fitted: StateSpaceFit) -> bool:
     return bool(fitted.maximum.point.x[at] < fitted.likelihood.lower[at] + 0.1)
 
 
-def likeliest_beside(found: StateSpaceFit, close: float, progress: Callable[[str], None]) -> StateSpaceFit:
+def likeliest_along_ridges(found: StateSpaceFit, close: float, progress: Callable[[str], None]) -> StateSpaceFit:
     """Return the fit at the likeliest of the maxima next to its own along its ridges, with what these add to the covariance.
 
     A ridge is how the others follow one parameter, by the covariance. Where the likelihood falls off along it by less than its
@@ -1438,13 +1456,13 @@ def likeliest_beside(found: StateSpaceFit, close: float, progress: Callable[[str
     are alike for many compliances. Where none of these stands out, the parameter is as uncertain as all of them are together.
     """
     likelihood, maximum = found.likelihood, found.maximum
-    for _ in range(HOPS):
+    for _ in range(MAX_RIDGE_MOVES):
         spread, best = np.zeros_like(maximum.covariance), maximum.point
         for j in _ridges(likelihood, maximum):
-            beside, more = _beside(likelihood, maximum, j)
+            beside, more = _scan_ridge(likelihood, maximum, j)
             spread += more
             best = max(best, beside, key=lambda p: p.log_likelihood)
-        if best.log_likelihood < maximum.point.log_likelihood + NEEDED:
+        if best.log_likelihood < maximum.point.log_likelihood + SIGNIFICANT_GAIN:
             break
         other = maximise(likelihood, best.x, close=close, widths=(), progress=progress)
         progress(f"log likelihood {other.point.log_likelihood:.1f} beside {maximum.point.log_likelihood:.1f}")
@@ -1458,7 +1476,7 @@ def _ridges(likelihood: Likelihood, maximum: Maximum) -> list[int]:
     for j in np.nonzero(variances[: len(likelihood.problem.names)] > 0)[0].tolist():
         d = PROBE * np.sqrt(variances[j])
         if d < RIDGE_REACH * _size(likelihood, point, j):
-            lost = [point.log_likelihood - along(likelihood, maximum, j, side * d).log_likelihood for side in (1, -1)]
+            lost = [point.log_likelihood - point_on_ridge(likelihood, maximum, j, side * d).log_likelihood for side in (1, -1)]
             if min(lost) < LOST_CURVATURE * PROBE**2 / 2:
                 found.append(j)
     return found
@@ -1468,7 +1486,7 @@ def _size(likelihood: Likelihood, point: Point, j: int) -> float:
     return 1.0 if likelihood.logarithmic[j] else abs(float(point.x[j]))
 
 
-def along(likelihood: Likelihood, maximum: Maximum, j: int, d: float) -> Point:
+def point_on_ridge(likelihood: Likelihood, maximum: Maximum, j: int, d: float) -> Point:
     """Return the point at which parameter j is moved by d, and the others as the covariance has it."""
     column = maximum.covariance[:, j] / maximum.covariance[j, j]
     x = np.clip(maximum.point.x + d * column, likelihood.lower, likelihood.upper)
@@ -1484,29 +1502,29 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
     """
     x = begun.x.copy()
     amplitude = likelihood.names.index("field_amplitude")
-    x[amplitude] = max(x[amplitude], _under_field(likelihood, x, *WIDE[0])[amplitude])
-    point, highest = likelihood.at(x), begun.log_likelihood + NEEDED
+    x[amplitude] = max(x[amplitude], _under_field(likelihood, x, *WIDE_FIELDS[0])[amplitude])
+    point, highest = likelihood.at(x), begun.log_likelihood + SIGNIFICANT_GAIN
     if not np.isfinite(point.log_likelihood):
         return None
     slopes, found = _slopes(likelihood, point), None
     for j in np.nonzero(np.diag(point.information)[: len(likelihood.problem.names)] > 0)[0].tolist():
-        narrow = _narrow(likelihood, point, slopes, j)
+        narrow = _narrow_maximum(likelihood, point, slopes, j)
         if narrow is None:
             continue
         run, half = narrow
-        reach, name = SCAN_REACH * _size(likelihood, point, j), likelihood.names[j]
-        low, high = max(point.x[j] - reach, likelihood.lower[j]), min(point.x[j] + reach, likelihood.upper[j])
+        half_width, name = SCAN_REACH * _size(likelihood, point, j), likelihood.names[j]
+        low, high = max(point.x[j] - half_width, likelihood.lower[j]), min(point.x[j] + half_width, likelihood.upper[j])
         if (high - low) / half > SCANNED:
             continue
         points = np.tile(point.x, (int((high - low) / half) + 2, 1))
         points[:, j] = np.linspace(low, high, len(points))
         here = likelihood.filtered(run, point.values)
-        most = MOST_WORK * here.found.steps
+        most = MAX_WORK_RATIO * here.found.steps
         told = np.array([likelihood.filtered(run, likelihood.values(y), most=most).log_likelihood for y in points])
         summit = told >= np.maximum(np.append(told[1:], -np.inf), np.append(-np.inf, told[:-1]))
-        likely = np.nonzero(summit & (told > max(here.log_likelihood + NEEDED, told.max() - PEAK / 2)))[0]
+        likely = np.nonzero(summit & (told > max(here.log_likelihood + SIGNIFICANT_GAIN, told.max() - PEAK / 2)))[0]
         likely = likely[np.argsort(-told[likely])][:PEAKS]
-        tops = [maximise(likelihood, points[k], held=[name], steps=PEAK_STEPS, widths=()).point for k in likely]
+        tops = [maximise(likelihood, points[k], fixed=[name], steps=PEAK_STEPS, widths=()).point for k in likely]
         if tops:
             top = max(tops, key=lambda p: p.log_likelihood)
             other = maximise(likelihood, top.x, steps=SCORING_STEPS // 2, close=1.0, widths=(), progress=progress)
@@ -1517,7 +1535,7 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
     return found
 
 
-def _narrow(
+def _narrow_maximum(
     likelihood: Likelihood, point: Point, slopes: Sequence[tuple[list[int], Array, Array]], j: int
 ) -> tuple[Run, float] | None:
     """Return the part of a run that shows a maximum of parameter j which no derivative leads to, and half its width.
@@ -1526,11 +1544,11 @@ def _narrow(
     derivatives want when the parameter goes far: two oscillations that are out of step differ by no more than themselves. Half
     of how far they move, squared, is the height of the maximum; the part of the run is as long as shows four times the least one.
     """
-    reach = FAR_PROBE / np.sqrt(point.information[j, j])
+    displacement = FAR_PROBE / np.sqrt(point.information[j, j])
     probes: list[Point] = []
     for side in (1, -1):
         y = point.x.copy()
-        y[j] += side * reach
+        y[j] += side * displacement
         if likelihood.lower[j] <= y[j] <= likelihood.upper[j]:
             probes.append(likelihood.at(y, slopes=False, like=point))
     if not probes or not all(np.isfinite(probe.log_likelihood) for probe in probes):
@@ -1540,7 +1558,7 @@ def _narrow(
         moves = [(probe.runs[at].every.nu - f.every.nu)[f.used] ** 2 / f.every.S[f.used] for probe in probes]
         moved = max(moves, key=lambda own: float(np.sum(own)))
         told = a[:, places.index(j)] ** 2 if j in places else np.zeros_like(moved)
-        if most < np.sum(moved) < LOST_CURVATURE * np.sum(told) * reach**2:
+        if most < np.sum(moved) < LOST_CURVATURE * np.sum(told) * displacement**2:
             most = float(np.sum(moved))
             few = min(int(np.searchsorted(np.cumsum(moved), 8 * PEAK)) + 1, moved.size)
             readings = max(int(f.used[few - 1]) // len(f.run.signals) + 1, 2)  # one alone has no interval
@@ -1548,14 +1566,14 @@ def _narrow(
     return found
 
 
-def _beside(likelihood: Likelihood, maximum: Maximum, j: int) -> tuple[Point, Array]:
+def _scan_ridge(likelihood: Likelihood, maximum: Maximum, j: int) -> tuple[Point, Array]:
     """Return the likeliest point on the ridge of parameter j, and what the points there add to the covariance (k, k)."""
     column, s = maximum.covariance[:, j] / maximum.covariance[j, j], float(np.sqrt(maximum.covariance[j, j]))
     points, places = [maximum.point], [0.0]
     count = int(np.clip(RIDGE_STRIDE * _size(likelihood, maximum.point, j) / (2 * s), *NEIGHBOUR_STEPS))
     for side in (1, -1):
         for k in range(1, count + 1):
-            points.append(along(likelihood, maximum, j, side * 2 * k * s))
+            points.append(point_on_ridge(likelihood, maximum, j, side * 2 * k * s))
             places.append(side * 2 * k * s)
     found, at = np.array([p.log_likelihood for p in points]), np.array(places)
     share = np.exp(found - found.max())
@@ -1581,7 +1599,7 @@ def with_less_colour(found: StateSpaceFit, close: float, progress: Callable[[str
                 before, after = own.gauge_names(kind), fewer.gauge_names(kind)
                 values |= {after[b]: found.values[before[a]] for a, b in zip(old, new, strict=True)}
         x = fewer.coordinates(values)
-        if fewer.at(x, slopes=False).log_likelihood < found.log_likelihood - CLOSE_CALL:
+        if fewer.at(x, slopes=False).log_likelihood < found.log_likelihood - EARLY_STOP_DEFICIT:
             break
         progress(f"coloured gauge noise: {', '.join(fewer.processes) or 'none'}")
         fewer_found = StateSpaceFit(fewer, maximise(fewer, x, close=close, widths=(), progress=progress))
@@ -1615,14 +1633,14 @@ def steadily_coloured(found: StateSpaceFit, cautious: bool = False) -> bool:
     model, where they are calm: what a model lacks may leave one at the frequency of a modulation, or of stick-slip.
     """
     point = found.maximum.point
-    if correlated(point) < DEVIATION:
+    if correlated(point) < MAX_DEVIATION:
         return False
-    pieces = [piece for f in point.runs for white in f.parts for piece in cut(white)]
-    judged = [(_ljung_box(piece) - LAGS) / np.sqrt(2 * LAGS) > SYSTEMATIC for piece in pieces]
+    pieces = [piece for f in point.runs for white in f.parts for piece in segments(white)]
+    judged = [(_ljung_box(piece) - LAGS) / np.sqrt(2 * LAGS) > PORTMANTEAU_LIMIT for piece in pieces]
     if 2 * sum(judged) > len(judged):
         return True
-    lines = [(kind, at) for kind, (height, at) in _lines(found).items() if height > DEVIATION]
-    return any(not cautious or _shown(found, kind, at) for kind, at in lines)
+    lines = [(kind, at) for kind, (height, at) in _lines(found).items() if height > MAX_DEVIATION]
+    return any(not cautious or _visible_without_model(found, kind, at) for kind, at in lines)
 
 
 def _lines(found: StateSpaceFit) -> dict[Kind, tuple[float, float]]:
@@ -1632,24 +1650,26 @@ def _lines(found: StateSpaceFit) -> dict[Kind, tuple[float, float]]:
     is in Hz. A line of the gauge is at one frequency in most stretches; a drive's or a track's changes with the velocity.
     """
     pieces: dict[Kind, list[Array]] = {}
-    for white, _, kind in found.likelihood.pieces(found.maximum.point):
-        count = white.size // PERIODOGRAM
-        pieces.setdefault(kind, []).append(np.clip(white[: count * PERIODOGRAM], -5.0, 5.0).reshape(count, PERIODOGRAM))
+    for white, _, kind in found.likelihood.innovations_by_kind(found.maximum.point):
+        count = white.size // PERIODOGRAM_SAMPLES
+        pieces.setdefault(kind, []).append(
+            np.clip(white[: count * PERIODOGRAM_SAMPLES], -5.0, 5.0).reshape(count, PERIODOGRAM_SAMPLES)
+        )
     lines = {}
     for kind, parts in pieces.items():
         power = np.abs(np.fft.rfft(np.concatenate(parts), axis=1)[:, 1:]) ** 2
         if power.size:
             middle = np.median(power, axis=0)
             height = (float(np.max(middle) / np.mean(power)) - np.log(2)) * np.sqrt(len(power))
-            lines[kind] = float(height), (1 + int(np.argmax(middle))) / (PERIODOGRAM * kind[1])
+            lines[kind] = float(height), (1 + int(np.argmax(middle))) / (PERIODOGRAM_SAMPLES * kind[1])
     return lines
 
 
-def _shown(found: StateSpaceFit, kind: Kind, frequency: float) -> bool:
+def _visible_without_model(found: StateSpaceFit, kind: Kind, frequency: float) -> bool:
     """Return whether most runs with this kind of gauge noise have an oscillation about a frequency that `srf check` finds."""
     from srfcli.data.experiment import check_run
 
-    within = max(SAME_RATE * frequency, 1 / (PERIODOGRAM * kind[1]))
+    within = max(SAME_RATE * frequency, 1 / (PERIODOGRAM_SAMPLES * kind[1]))
     own = [f.run for f in found.maximum.point.runs if kind in found.likelihood.kinds_of(f.run)]
     seen = [[c for noise in check_run(run).noises for c in noise.colours if len(c) == 3] for run in own]
     return 2 * sum(any(abs(c[0] - frequency) < within for c in colours) for colours in seen) > len(seen)
@@ -1671,44 +1691,50 @@ def _ljung_box(white: Array) -> float:
     return sum(n * (n + 2) / (n - k) * (float(c[k:] @ c[:-k]) / square) ** 2 for k in range(1, LAGS + 1)) if square else 0.0
 
 
-def cut(white: Array) -> list[Array]:
+def segments(white: Array) -> list[Array]:
     """Return innovations (m,) in stretches that are long enough to be judged each, at most 20."""
     return np.array_split(white, max(min(20, white.size // 50), 1))
 
 
-def _small_field(rough: Likelihood, plain: Point) -> Point | None:
+def _small_field(field_likelihood: Likelihood, plain: Point) -> Point | None:
     """Return where a few steps lead from the likeliest of a few small fields beside a fit, None where that gains too little.
 
     The likeliest amplitude is taken at the middle length, and then the likeliest length.
     """
-    x, middle = rough.coordinates(plain.values), len(SHORT) // 2
+    x, middle = field_likelihood.coordinates(plain.values), len(FAINT_FIELD_LENGTHS) // 2
 
     def tried(share: float, short: float) -> tuple[float, float, float]:
-        return rough.at(_under_field(rough, x, share * FAINT_FIELD, short), slopes=False).log_likelihood, share, short
+        return (
+            field_likelihood.at(_under_field(field_likelihood, x, share * FAINT_FIELD, short), slopes=False).log_likelihood,
+            share,
+            short,
+        )
 
-    likeliest = max(tried(share, SHORT[middle]) for share in FAINT_FIELDS)
-    height, share, short = max(likeliest, *(tried(likeliest[1], s) for s in (*SHORT[:middle], *SHORT[middle + 1 :])))
+    likeliest = max(tried(share, FAINT_FIELD_LENGTHS[middle]) for share in FAINT_FIELDS)
+    height, share, short = max(
+        likeliest, *(tried(likeliest[1], s) for s in (*FAINT_FIELD_LENGTHS[:middle], *FAINT_FIELD_LENGTHS[middle + 1 :]))
+    )
     if not np.isfinite(height):
         return None
-    x, least = _under_field(rough, x, share * FAINT_FIELD, short), plain.log_likelihood + NEEDED
+    x, least = _under_field(field_likelihood, x, share * FAINT_FIELD, short), plain.log_likelihood + SIGNIFICANT_GAIN
     for _ in range(FIELD_STEPS // 2):
-        found = maximise(rough, x, steps=2, widths=())
+        found = maximise(field_likelihood, x, steps=2, widths=())
         if found.expected < least or found.away < CONVERGED or np.array_equal(found.point.x, x):
             break
         x = found.point.x
     return found.point if found.point.log_likelihood > least else None
 
 
-def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
+def _shrunk(field_likelihood: Likelihood, point: Point, at: int) -> Point:
     """Return the point with the likeliest of ever smaller amplitudes of the field, the other parameters as they are."""
     best, x = (point.log_likelihood, point.x), point.x.copy()
-    while x[at] > rough.lower[at]:
-        x[at] = max(x[at] - FIELD_SHRINKS, rough.lower[at])
-        found = rough.at(x, slopes=False).log_likelihood
+    while x[at] > field_likelihood.lower[at]:
+        x[at] = max(x[at] - FIELD_SHRINKS, field_likelihood.lower[at])
+        found = field_likelihood.at(x, slopes=False).log_likelihood
         if found < best[0]:
             break
         best = found, x.copy()
-    return point if best[1] is point.x else rough.at(best[1])
+    return point if best[1] is point.x else field_likelihood.at(best[1])
 
 
 def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str], None]) -> StateSpaceFit:
@@ -1727,7 +1753,7 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
     best = -np.inf
     for base in _slow_fields(wider, x):
         likeliest = [(-np.inf, base)] * len(owns)
-        for place, part in product(range(len(starts[0])), COLOURED):
+        for place, part in product(range(len(starts[0])), COLOUR_SHARES):
             trial = base.copy()
             for own, start in zip(owns, starts, strict=True):
                 levels = [own["gauge_white"], *(own[f"gauge_colour{j}"] for j in range(1, number))]
@@ -1743,7 +1769,7 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
             for own, (_, trial) in zip(owns, likeliest, strict=True):
                 x[list(own.values())] = trial[list(own.values())]
     progress(f"coloured gauge noise: {', '.join(wider.processes)}")
-    steps = 20 if best > fitted.log_likelihood - HOPELESS else 0
+    steps = 20 if best > fitted.log_likelihood - PRUNING_DEFICIT else 0
     maximum = maximise(wider, x, steps=steps, close=1.0, progress=progress)
     return StateSpaceFit(wider, maximum)
 
@@ -1757,52 +1783,52 @@ def _slow_fields(wider: Likelihood, x: Array) -> Iterator[Array]:
         yield _under_field(wider, x, share * FAINT_FIELD, 1.0)
 
 
-def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Array:
+def _under_field(field_likelihood: Likelihood, x: Array, wide: float, short: float) -> Array:
     """Return x under a field of amplitude `wide` over the friction of the recordings, its length `short` times the start's."""
-    amplitude, length = (rough.names.index(n) for n in FIELD)
+    amplitude, length = (field_likelihood.names.index(n) for n in FIELD)
     found = x.copy()
-    found[amplitude], found[length] = _amplitude(rough, wide), rough.start[length] + np.log(short)
+    found[amplitude], found[length] = _amplitude(field_likelihood, wide), field_likelihood.start[length] + np.log(short)
     return found
 
 
-def _amplitude(rough: Likelihood, share: float) -> float:
+def _amplitude(field_likelihood: Likelihood, share: float) -> float:
     """Return the coordinate of a field's amplitude that is this share of the friction of the recordings."""
-    return float(rough.lower[rough.names.index("field_amplitude")] + np.log(share / LEAST_FIELD))
+    return float(field_likelihood.lower[field_likelihood.names.index("field_amplitude")] + np.log(share / LEAST_FIELD))
 
 
-def wide_starts(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Iterator[Array]:
+def wide_starts(field_likelihood: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Iterator[Array]:
     """Yield x at `start` under one wide field after the other, where the filter stays with the recordings."""
-    x = rough.coordinates(start)
+    x = field_likelihood.coordinates(start)
     if "field_amplitude" in start:
         yield x
         return
-    amplitude, length = (rough.names.index(n) for n in FIELD)
-    for wide, long in WIDE:
-        trial = rough.at(_under_field(rough, x, wide, long), slopes=False)
+    amplitude, length = (field_likelihood.names.index(n) for n in FIELD)
+    for wide, long in WIDE_FIELDS:
+        trial = field_likelihood.at(_under_field(field_likelihood, x, wide, long), slopes=False)
         field = f"field of {np.exp(trial.x[amplitude]):.2g} over {np.exp(trial.x[length]):.2g} um"
         progress(f"{field}: log likelihood {trial.log_likelihood:.1f}")
         if np.isfinite(trial.log_likelihood):
             yield trial.x
 
 
-def multi_start(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
+def multi_start(field_likelihood: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
     """Return SOBOL_STARTS starts over the bounds, mu0 that of the recordings, under wide fields in turn, the likeliest first.
 
     A model that slips without end at the file's start values, as one without inertia may, is followed from others.
     """
     from scipy.stats import qmc
 
-    k = len(rough.problem.names)
-    levels = [i for i, n in enumerate(rough.problem.names) if n.partition("[")[0] == "mu0"]
-    seen = float(np.median([typical_friction(run) for run in rough.problem.runs]))
+    k = len(field_likelihood.problem.names)
+    levels = [i for i, n in enumerate(field_likelihood.problem.names) if n.partition("[")[0] == "mu0"]
+    seen = float(np.median([typical_friction(run) for run in field_likelihood.problem.runs]))
     trials: list[tuple[float, Array]] = []
     for number, share in enumerate(qmc.Sobol(k, seed=0).random(SOBOL_STARTS)):
         trial = x.copy()
-        trial[:k] = rough.lower[:k] + share * (rough.upper - rough.lower)[:k]
-        trial[levels] = np.where(rough.logarithmic[levels], np.log(seen), seen)
-        trial = np.clip(trial, rough.lower, rough.upper)
-        trial = _under_field(rough, trial, *WIDE[number % len(WIDE)])
-        found = rough.at(trial, slopes=False).log_likelihood
+        trial[:k] = field_likelihood.lower[:k] + share * (field_likelihood.upper - field_likelihood.lower)[:k]
+        trial[levels] = np.where(field_likelihood.logarithmic[levels], np.log(seen), seen)
+        trial = np.clip(trial, field_likelihood.lower, field_likelihood.upper)
+        trial = _under_field(field_likelihood, trial, *WIDE_FIELDS[number % len(WIDE_FIELDS)])
+        found = field_likelihood.at(trial, slopes=False).log_likelihood
         progress(f"from another start: log likelihood {found:.1f}")
         if np.isfinite(found):
             trials.append((found, trial))
@@ -1825,7 +1851,7 @@ def as_fit(found: StateSpaceFit) -> Fit:
         runs.append(first)
         others += beside
     return Fit(
-        problem.names, {**problem.held, **{n: values[n] for n in problem.names}}, found.covariance[:k, :k], problem.lower,
+        problem.names, {**problem.fixed_values, **{n: values[n] for n in problem.names}}, found.covariance[:k, :k], problem.lower,
         problem.upper,
         tuple(runs), found.log_likelihood, maximum.status, found.evaluations, others=tuple(others),
         tables=(*maximum.point.tables, *tables),

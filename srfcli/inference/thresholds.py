@@ -48,7 +48,8 @@ SURVEY_REACH = 0.2  # of ln W0, summed over the parameters' changes since a line
 CLOSE_CROSSING = 0.1  # of the datum's load: a crossing further off than this is followed only to know how far to look
 MOST_MOVED = 0.2  # in ln W0 from where a crossing was expected: it is another one then
 STALE_SLOPES = 0.03  # in ln W0: derivatives from further off no longer predict
-RIVAL = (2.0, 0.05)  # crossings within this many times the nearest's distance, and this share of the load, are followed too
+# crossings within this many times the nearest's distance, and this share of the load, are followed too
+RIVAL_CROSSING_LIMITS = (2.0, 0.05)
 MAX_MESH = 512
 
 
@@ -90,7 +91,7 @@ class Match:
 
 
 @dataclass
-class _Line:
+class _LineState:
     """What is known of the line of one datum (N): its odd crossings, and where it was last surveyed."""
 
     datum: float
@@ -129,7 +130,7 @@ class Matcher:
         self._rho_is_ours = RHO.name not in model.names
         own = {name: value for name, value in values.items() if name in model.names}
         self._base = model.vector({**own, "V": table.V, "eps": table.eps, "W0": table.W0c})
-        self._lines = [_Line(datum) for datum in table.W0c]
+        self._lines = [_LineState(datum) for datum in table.W0c]
         self._names = tuple("eps" if self._acts_by_eps(name) else name for name in scale.names)
 
     def _acts_by_eps(self, name: str) -> bool:
@@ -189,7 +190,7 @@ class Matcher:
                 slopes[:, column] *= self.table.eps[rows]
         return slopes * self.scale.rates(y)
 
-    def _at_rest(self, line: _Line, y: Array, p: Array) -> None:
+    def _at_rest(self, line: _LineState, y: Array, p: Array) -> None:
         """Set the odd crossings of a line under constant load: all of them are roots of a polynomial."""
         datum = line.datum
         points = [q for q in hopf_points(self.model, p) if q.leading and q.crossing_rate > 0]
@@ -197,7 +198,7 @@ class Matcher:
         if not line.odd:
             line.end = datum * FAR_CROSSING if steady_is_stable(self.model, p, datum / FAR_CROSSING) else datum / FAR_CROSSING
 
-    def _survey(self, line: _Line, y: Array, p: Array, first: float) -> None:
+    def _survey(self, line: _LineState, y: Array, p: Array, first: float) -> None:
         """Set the odd crossings of a line by a search of its own: near the datum, and further where that decides nothing."""
         datum = line.datum
         for reach in dict.fromkeys((first, NEAR_LOADS, FAR_CROSSING)):
@@ -226,7 +227,7 @@ class Matcher:
                 continue
             expected = [c.expected(y) for c in line.odd]
             distance = [abs(w - line.datum) for w in expected]
-            most = RIVAL[0] * min(distance) + RIVAL[1] * line.datum
+            most = RIVAL_CROSSING_LIMITS[0] * min(distance) + RIVAL_CROSSING_LIMITS[1] * line.datum
             tracked += [(i, j, w) for j, w in enumerate(expected) if distance[j] <= most]
         reached: dict[int, list[float]] = {}
         for (i, j, load), point in zip(tracked, self._polish(tracked, p), strict=True):
@@ -311,15 +312,15 @@ def _coefficients(model: GeneratedModel, p: Array, name: str | None) -> tuple[Ar
 
 # Parameters from measured critical loads: the paper's procedure with Powell's method, and a least squares beside it.
 
-METHODS = ("powell", "least-squares")
+FIT_METHODS = ("powell", "least-squares")
 MAX_EVALUATIONS = 2000
 SURVEY_ROUNDS = 3  # fits from where a survey of the solution found nearer crossings
 FIRST_STEP = 0.05  # in a coordinate: with it Powell's method brackets the minimum on a line
 LEAST_CHANGES = 1.0, 30.0  # times the loads' accuracy: changes of chi2 and of the coordinates that end the least squares
 POWELL_SETTLED = 1e-4  # the same for a round of Powell's method through all directions
-PERFECT = 3.0  # times the accuracy of the critical loads: residuals all below it are as good as none
-DETOURS = 3  # times that a least squares goes around a jump of the cost
-CLIFF, JUMP = 1e-3, 0.02  # a load that changes by so much, in ln W0, over so little in a coordinate has jumped
+PERFECT_FIT_RATIO = 3.0  # times the accuracy of the critical loads: residuals all below it are as good as none
+MAX_DETOURS = 3  # times that a least squares goes around a jump of the cost
+JUMP_STEP, JUMP_SIZE = 1e-3, 0.02  # a load that changes by so much, in ln W0, over so little in a coordinate has jumped
 BEYOND_BOUND = 0.05  # a coordinate this far beyond its bound doubles Powell's cost
 
 Report = Callable[["Trace"], None]
@@ -396,7 +397,7 @@ class _Stop(Exception):
         self.status = status
 
 
-class _Work:
+class _MethodRun:
     """One method's run: evaluates the cost, keeps the best match and the trace, and stops the method where it should."""
 
     def __init__(self, matcher: Matcher, method: str, limit: int, report: Report | None) -> None:
@@ -425,18 +426,18 @@ class _Work:
         self.trace.cpu.append(time.process_time() - self.begun)
         if self.report is not None:
             self.report(self.trace)
-        if np.abs(match.loads - self.matcher.table.W0c).max() < PERFECT * self.matcher.tol * match.loads.min():
+        if np.abs(match.loads - self.matcher.table.W0c).max() < PERFECT_FIT_RATIO * self.matcher.tol * match.loads.min():
             raise _Stop(Status.OK)
         return match
 
     def jumped(self) -> Array:
-        """Return for each datum (n,) whether its load changed by JUMP within CLIFF of the best coordinates found."""
+        """Return for each datum (n,) whether its load changed by JUMP_SIZE within JUMP_STEP of the best coordinates found."""
         jumped = np.zeros(len(self.matcher.table), dtype=bool)
         best = self.best
         if best is not None:
             for y, loads in self._seen:
-                if np.abs(y - best.y).max() < CLIFF:
-                    jumped |= np.abs(np.log(loads / best.loads)) > JUMP
+                if np.abs(y - best.y).max() < JUMP_STEP:
+                    jumped |= np.abs(np.log(loads / best.loads)) > JUMP_SIZE
         return jumped
 
     def jacobian(self, y: Array) -> Array:
@@ -451,7 +452,7 @@ def fit_thresholds(
     *,
     scale: Scale,
     values: Mapping[str, float],
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] = FIT_METHODS,
     tol: float = 1e-6,
     max_evaluations: int = MAX_EVALUATIONS,
     profile: bool = False,
@@ -464,8 +465,8 @@ def fit_thresholds(
     best found so far, its status says so.
     """
     for name in methods:
-        if name not in METHODS:
-            raise SrfError(f"unknown method {name!r}", did_you_mean(name, METHODS))
+        if name not in FIT_METHODS:
+            raise SrfError(f"unknown method {name!r}", did_you_mean(name, FIT_METHODS))
     if len(table) < len(scale):
         raise SrfError(
             f"{table.source}: {len(table)} critical loads for {len(scale)} free parameters",
@@ -481,7 +482,7 @@ def fit_thresholds(
     done = ThresholdFit(table, scale, tuple(fits), worst)
     if worst is Status.INTERRUPTED or not done.best.status.ok:
         return done
-    work = _Work(Matcher(model, table, values=values, scale=scale, tol=tol), "profile", sys.maxsize, report)
+    work = _MethodRun(Matcher(model, table, values=values, scale=scale, tol=tol), "profile", sys.maxsize, report)
     try:
         if profile:
             return replace(done, intervals=_profiles(work, done.best))
@@ -497,7 +498,7 @@ def _ridge(scale: Scale, best: MethodFit, k: int) -> tuple[float, Array]:
     return float(errors[k]), moves
 
 
-def _not_quadratic(work: _Work, best: MethodFit) -> tuple[str, ...]:
+def _not_quadratic(work: _MethodRun, best: MethodFit) -> tuple[str, ...]:
     """Return the parameters at whose ends of 1.96 standard errors, the others by correlation, chi2 is not what these say."""
     scale, found = work.matcher.scale, []
     for k, name in enumerate(scale.names):
@@ -509,7 +510,7 @@ def _not_quadratic(work: _Work, best: MethodFit) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _profiles(work: _Work, best: MethodFit) -> tuple[Interval, ...]:
+def _profiles(work: _MethodRun, best: MethodFit) -> tuple[Interval, ...]:
     """Return the interval of each parameter by the profile likelihood: each held on either side, the others fitted again."""
     found = []
     for k, q in enumerate(work.matcher.scale):
@@ -519,7 +520,7 @@ def _profiles(work: _Work, best: MethodFit) -> tuple[Interval, ...]:
     return tuple(found)
 
 
-def _end(work: _Work, best: MethodFit, k: int, side: float, refits: Refits) -> float | None:
+def _end(work: _MethodRun, best: MethodFit, k: int, side: float, refits: Refits) -> float | None:
     """Return where the profile of coordinate k crosses CHI2_95 on one side."""
     scale, top = work.matcher.scale, best.match.y
     error, along = _ridge(scale, best, k)
@@ -534,7 +535,7 @@ def _end(work: _Work, best: MethodFit, k: int, side: float, refits: Refits) -> f
             _trust_region(work, start, everything, others)
         assert work.best is not None
         last = work.best.y
-        return refits.met(work.best.cost - best.cost, dict(zip(scale.names, scale.values(last).tolist(), strict=True)))
+        return refits.record(work.best.cost - best.cost, dict(zip(scale.names, scale.values(last).tolist(), strict=True)))
 
     bound = scale.bounds[0 if side < 0 else 1]
     distance = interval_end(deviance, error, float(abs(bound[k] - top[k])))
@@ -543,7 +544,7 @@ def _end(work: _Work, best: MethodFit, k: int, side: float, refits: Refits) -> f
 
 def _run(matcher: Matcher, method: str, limit: int, report: Report | None) -> MethodFit:
     """Run one method, survey its solution, and run it again from there where that finds nearer crossings."""
-    work, status, notes = _Work(matcher, method, limit, report), Status.OK, []
+    work, status, notes = _MethodRun(matcher, method, limit, report), Status.OK, []
     minimise = {"powell": _powell, "least-squares": _least_squares}[method]
     y = np.zeros(len(matcher.scale))
     first = matcher.match(y, anew=True)  # the start has to be known, interrupted or not
@@ -599,7 +600,7 @@ def match_notes(table: Thresholds, match: Match) -> list[str]:
     return notes
 
 
-def _least_squares(work: _Work, y: Array) -> Status:
+def _least_squares(work: _MethodRun, y: Array) -> Status:
     """Run the least squares; where a crossing's jump stops it, once more without the data that jumped, then with all again.
 
     At a fold two crossings merge, and the nearest odd one is suddenly another: the cost has a cliff, before which its derivatives
@@ -607,7 +608,7 @@ def _least_squares(work: _Work, y: Array) -> Status:
     """
     everything = np.ones(len(work.matcher.table), dtype=bool)
     status, _ = _trust_region(work, y, everything)
-    for _ in range(DETOURS):
+    for _ in range(MAX_DETOURS):
         before = work.best
         jumped = work.jumped()
         if before is None or not jumped.any() or len(jumped) - jumped.sum() < len(work.matcher.scale):
@@ -625,7 +626,7 @@ def _least_squares(work: _Work, y: Array) -> Status:
     return status
 
 
-def _trust_region(work: _Work, y: Array, kept: Array, free: Array | None = None) -> tuple[Status, Array]:
+def _trust_region(work: _MethodRun, y: Array, kept: Array, free: Array | None = None) -> tuple[Status, Array]:
     """Minimise the squares of the residuals `kept` (n,) from coordinates `y`, those `free` (k,); return where that ended."""
     from scipy.optimize import least_squares
 
@@ -655,7 +656,7 @@ def _trust_region(work: _Work, y: Array, kept: Array, free: Array | None = None)
     return Status.OK if done.status > 0 else Status.EVALUATIONS, whole(done.x)
 
 
-def _powell(work: _Work, y: Array) -> Status:
+def _powell(work: _MethodRun, y: Array) -> Status:
     """Run Powell's method in units of FIRST_STEP; beyond a bound the cost is that at the bound, raised with the distance.
 
     Handing the bounds to scipy instead would make it search every line from bound to bound.
@@ -679,8 +680,8 @@ def _powell(work: _Work, y: Array) -> Status:
 # What a fit of critical loads knows: standard errors, correlations, and the combinations that the data leave open.
 
 AT_BOUND = 1e-6  # of the distance between the bounds, in the parameter's coordinate
-BLIND = 1e-9  # eigenvalues of the information below this share of the largest are rounding
-LOOSE = 1.0  # a standard error in ln(value) from which the data say nothing of the value
+MIN_EIGENVALUE_SHARE = 1e-9  # eigenvalues of the information below this share of the largest are rounding
+UNDETERMINED_ERROR = 1.0  # a standard error in ln(value) from which the data say nothing of the value
 LEAST_SHARE = 0.1  # a combination lists the parameters that carry at least this share
 
 
@@ -729,14 +730,14 @@ def uncertainty(scale: Scale, y: Array, jacobian: Array) -> Uncertainty:
     for i, (q, error) in enumerate(zip(scale, errors, strict=True)):
         if np.isinf(error):
             flags[i] = "not identifiable: other parameters undo it exactly"
-        elif error > LOOSE:
+        elif error > UNDETERMINED_ERROR:
             flags[i] = "not identifiable: its error exceeds its value" if q.log else "hardly identifiable"
     return Uncertainty(errors * scale.rates(y), tuple(flags), correlation, values, vectors, _weakest(scale, values, vectors))
 
 
 def _covariance(values: Array, vectors: Array) -> Array:
     """Return the inverse of the information with these eigenvalues, infinite in what its null space holds."""
-    blind = values <= BLIND * values.max(initial=0.0)
+    blind = values <= MIN_EIGENVALUE_SHARE * values.max(initial=0.0)
     kept = vectors[:, ~blind]
     covariance = (kept / values[~blind]) @ kept.T
     lost = (np.abs(vectors[:, blind]) > 1e-3).any(axis=1)
@@ -757,7 +758,7 @@ def _weakest(scale: Scale, values: Array, vectors: Array) -> str:
             sign = ("- " if weight < 0 else "+ ") if terms else ""
             size = "" if abs(abs(weight) - 1) < 5e-3 else f"{abs(weight):.2f} "
             terms.append(f"{sign}{size}{name}")
-    if values[0] <= BLIND * values.max():
+    if values[0] <= MIN_EIGENVALUE_SHARE * values.max():
         return f"{' '.join(terms)}: not determined at all"
     length = np.linalg.norm(direction)  # the error is that of the formula as it is written
     return f"{' '.join(terms)}: standard error {length / np.sqrt(values[0]):.2g}"

@@ -360,7 +360,9 @@ class _Block:
         ]
         if beside:
             c, r, from_c, from_r = beside[int(share * len(beside))]
-            guess = settle(self.model, orbits.p[:, c, r], orbits.orbit.x[from_c, from_r, 0], orbits.orbit.edges)
+            guess = integrate_to_periodic_state(
+                self.model, orbits.p[:, c, r], orbits.orbit.x[from_c, from_r, 0], orbits.orbit.edges
+            )
             if guess is not None:
                 self._solve(np.array([c]), np.array([r]), guess)
                 found[c, r] = converged[c, r]
@@ -389,7 +391,7 @@ class _Block:
         self.orbits.replace((c[good], r[good]), batch.part(good))
 
 
-def settle(model: GeneratedModel, p: Array, start: Array, edges: Array) -> Discretisation | None:
+def integrate_to_periodic_state(model: GeneratedModel, p: Array, start: Array, edges: Array) -> Discretisation | None:
     """Return the last of SETTLING periods of the motion that begins in the state `start` (n,), or None where it stops early."""
     V, W0, eps, f = (float(p[model.index(name)]) for name in ("V", "W0", "eps", "f"))
     blank = np.zeros((len(edges) - 1, STAGES, len(start)))

@@ -113,7 +113,7 @@ class CheckResult(Result):
             parameters[p.name] = {"value": value, "unit": unit, "origin": origin}
         title = experiment.title or experiment.path.parent.name
         rows = [row(check, bound) for check, bound in found]
-        columns = tuple(dataclasses.replace(c, unit=shown_unit(c.unit, stress=experiment.stress)) for c in COLUMNS)
+        columns = tuple(dataclasses.replace(c, unit=shown_unit(c.unit, stress=experiment.stress)) for c in CHECK_COLUMNS)
         return Table("srf.check/3", columns, rows, title, tuple(notes), parameters, meta)
 
     @cached_property
@@ -150,7 +150,7 @@ class CheckResult(Result):
 
 # The tables of `srf check`: all columns for programs, rounded ones that fit a page for readers, and everything for JSON.
 
-COLUMNS = (
+CHECK_COLUMNS = (
     Column("run", "", "name"),
     Column("role", "", "fit, or held out"),
     Column("samples", about="samples with a time of their own"),
@@ -188,7 +188,7 @@ COLUMNS = (
 
 
 def row(check: RunCheck, told: CramerRaoBound | None) -> tuple[Any, ...]:
-    """Return the cells of one run under COLUMNS."""
+    """Return the cells of one run under CHECK_COLUMNS."""
     run, load, rates = check.run, check.load, [1 / r.interval for r in check.sampling.rates]
     read, found = run.observed[run.used], load.modulation
     mean, lowest, highest = (load.mean, load.lowest, load.highest) if run.load_known else (None, None, None)
@@ -206,7 +206,7 @@ def row(check: RunCheck, told: CramerRaoBound | None) -> tuple[Any, ...]:
         "onset": found.onset if found and math.isfinite(found.onset) else None,
         **{f"{name}_{key}": found_out.get(key, {}).get(name) for name in CHANGES for key in ("error", "peak")},
     }  # fmt: skip
-    return tuple(cells[column.name] for column in COLUMNS)
+    return tuple(cells[column.name] for column in CHECK_COLUMNS)
 
 
 def _noise_table(checks: Sequence[RunCheck]) -> Table:

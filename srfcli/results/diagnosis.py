@@ -327,7 +327,7 @@ class DiagnosisResult(Result):
                 shutil.copyfile(source, fresh / "augmented" / name)
             made_of = {**self._material, "system": augmented.options("augmented")}
             diagram = stability(
-                self.registry, diagnosis.experiment, diagnosis.shown.fit.values,
+                self.registry, diagnosis.experiment, diagnosis.reported_baseline.fit.values,
                 replace(as_fitted(last), runs=diagnosis.experiment.runs), augmented.left,
             )  # fmt: skip
             if diagram:

@@ -76,7 +76,7 @@ def recordings(checks: Sequence[RunCheck], *, title: str = "") -> Figure:
             _panel(axes, check)
             figure.align_ylabels(axes)
         plots.heading(figure, plots.name_text(title, wide=True))
-        settle(figure)
+        fix_layout(figure)
         return figure
 
 
@@ -87,7 +87,7 @@ def stacked(figure: Figure, cell: Any, heights: Sequence[float], *, hspace: floa
     return [first, *(figure.add_subplot(rows[i], sharex=first) for i in range(1, len(heights)))]
 
 
-def settle(figure: Figure) -> None:
+def fix_layout(figure: Figure) -> None:
     """Fix the layout at rounded positions: the last digits of the layout solver differ from run to run."""
     from matplotlib import rc_context
 

@@ -17,12 +17,12 @@ from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
 from srfcli.data.thresholds import Thresholds
 from srfcli.data.values import BETWEEN_SAMPLES, Experiment, Run, told_of_runs
-from srfcli.inference.critical_loads import IMPROBABLE, chance_of
+from srfcli.inference.critical_loads import MIN_P_VALUE, chi2_p_value
 from srfcli.inference.fit import Fit, RunFit
 from srfcli.inference.noise import lag_one
 from srfcli.inference.posterior import Posterior, not_quadratic
-from srfcli.inference.profile import FARTHER, Interval
-from srfcli.inference.state_space import WIDE, typical_friction
+from srfcli.inference.profile import MAX_INTERVAL_RATIO, Interval
+from srfcli.inference.state_space import WIDE_FIELDS, typical_friction
 from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
 from srfcli.results.figures import draw_loads, stacked
@@ -262,13 +262,13 @@ class FitResult(Result):
     @cached_property
     def against(self) -> list[str]:
         """Return what speaks against the model, in sentences: random friction that no track has, tests that the fit fails."""
-        from srfcli.diagnosis.goodness_of_fit import PLAUSIBLE, shortcomings
+        from srfcli.diagnosis.goodness_of_fit import MAX_FIELD_AMPLITUDE, failed_tests
 
         found, told = self.found, []
-        if (share := self._field_share) > PLAUSIBLE:
+        if (share := self._field_share) > MAX_FIELD_AMPLITUDE:
             told.append(f"the friction field is {float(f'{100 * share:.1g}'):g} % of the friction, more than a track has")
         if found.state_space is not None and found.status.ok:
-            failed = [text for text in shortcomings(found.state_space) if not text.startswith("the field's amplitude")]
+            failed = [text for text in failed_tests(found.state_space) if not text.startswith("the field's amplitude")]
             told += [f"the fit fails a test: {text}" for text in dict.fromkeys(failed[:TESTS_TOLD])]
         return told
 
@@ -352,7 +352,7 @@ class FitResult(Result):
 
             own = own_levels(found.state_space)
             notes += own
-        if self._field_share > WIDE[0][0] and not own:
+        if self._field_share > WIDE_FIELDS[0][0] and not own:
             notes.append(
                 "under so wide a field a recording is followed whatever the parameters are, and the maximum may be a wrong one: "
                 "try --starts 5, or start values nearer to what is known"
@@ -452,7 +452,7 @@ def said_not_quadratic(names: Sequence[str]) -> list[str]:
 def farther(
     intervals: Sequence[Interval], values: Sequence[float], errors: Sequence[float], bounds: Sequence[tuple[float, float]]
 ) -> list[str]:
-    """Return a sentence where intervals, of the first parameters or all, reach FARTHER than standard errors say."""
+    """Return a sentence where intervals, of the first parameters or all, are longer than MAX_INTERVAL_RATIO allows."""
     told = []
     for interval, value, error, (lower, upper) in zip(intervals, values, errors, bounds, strict=False):
         if not (np.isfinite(error) and error > 0):
@@ -460,7 +460,7 @@ def farther(
         for way, end, bound in (("down", interval.low, lower), ("up", interval.high, upper)):
             if end is None and abs(bound - value) > 1.96 * error:
                 told.append(f"{interval.name} without end {way}")
-            elif end is not None and abs(end - value) > FARTHER * 1.96 * error:
+            elif end is not None and abs(end - value) > MAX_INTERVAL_RATIO * 1.96 * error:
                 told.append(f"{interval.name} {abs(end - value) / (1.96 * error):.1f} times as far {way}")
     said = "the likelihood is not quadratic, and standard errors are too small. 95 % intervals reach, over 1.96 standard errors, "
     return [f"{said}{', '.join(told)}: take low and high. Fewer free parameters or other data narrow them"] if told else []
@@ -479,7 +479,7 @@ def said_likelier(intervals: Sequence[Interval], shown: Callable[[str, float], t
 
 def chi2_notes(of: str, cost: float, freedom: int) -> list[str]:
     """Return a note where a chi2 of critical loads is larger than chance has it."""
-    if (chance := chance_of(cost, freedom)) >= IMPROBABLE:
+    if (chance := chi2_p_value(cost, freedom)) >= MIN_P_VALUE:
         return []
     said = f"{of}: chi2 {cost:.4g} on {freedom} degrees of freedom, chance {chance:.1g}"
     return [f"{said}; the model does not describe the loads within sigma, and the errors do not allow for that"]
@@ -561,7 +561,7 @@ ESTIMATES = (
     Column("start", "", "where the fit began"),
     Column("flag", "", "why an error is missing or means nothing"),
 )
-METHODS = (
+METHOD_COLUMNS = (
     METHOD,
     Column("status", "", STATUS),
     Column("chi2_start", "1", "sum of squared residuals in sigma at the start"),
@@ -665,7 +665,7 @@ class ThresholdFitResult(Result):
             (m.method, m.status.value, m.start_cost, m.cost, self._freedom, *m.paper_cost, m.evaluations, m.gradients, m.surveys)
             for m in self.found.methods
         ]
-        return Table("srf.fit-thresholds.methods/1", METHODS, rows, "Methods")
+        return Table("srf.fit-thresholds.methods/1", METHOD_COLUMNS, rows, "Methods")
 
     @cached_property
     def trace(self) -> Table:

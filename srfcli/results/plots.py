@@ -34,7 +34,7 @@ DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (9, 2)
 DOTTED = (0, (1, 1.2))  # kept for the constant load
 # one quantity, one colour, in every figure
 QUANTITY = {"u": COLOURS[0], "v": COLOURS[1], "V": COLOURS[6], "mu": COLOURS[2], "W": COLOURS[3], "state": COLOURS[5]}
-SYMBOLS = {
+PLOT_SYMBOLS = {
     "W0": "W$_0$", "V0": "V$_0$", "D0": "D$_0$", "mu0": "µ$_0$", "Vsat": "V$_{sat}$", "Va": "V$_a$", "Vb": "V$_b$", "eps": "ε",
     "lambda": "λ", "alpha": "α", "phi": "φ",
 }  # fmt: skip
@@ -171,7 +171,7 @@ def figure_bytes(figure: Figure, suffix: str, *, dpi: float | None = None) -> by
 
 def symbol_text(name: str) -> str:
     """Return a parameter's name as it is set in a figure: W$_0$ for W0, ε for eps."""
-    return SYMBOLS.get(name) or name_text(name)
+    return PLOT_SYMBOLS.get(name) or name_text(name)
 
 
 def axis_label(name: str, unit: str) -> str:

@@ -27,6 +27,7 @@ from srfcli.results.report_text import (
     NO_BREAK,
     bracketed,
     finite,
+    format_with_error,
     gain_sentence,
     joined,
     number,
@@ -38,7 +39,6 @@ from srfcli.results.report_text import (
     spans,
     unit_text,
     verdict_sentence,
-    with_error,
     with_unit,
 )
 from srfcli.results.tables import Markup, plain_value, tag
@@ -215,7 +215,9 @@ def _location_sentences(matter: Matter) -> list[str]:
 
 def _frequencies(matter: Matter, narrow: Sequence[float]) -> list[str]:
     """Return where in frequency the misfit is, the strongest place of the table and the figure first."""
-    seen = [s for s in report_figures.spots(matter.rows("residual_scan"), matter.load_unit) if s.axis == "frequency" and s.sure]
+    seen = [
+        s for s in report_figures.scan_rows(matter.rows("residual_scan"), matter.load_unit) if s.axis == "frequency" and s.sure
+    ]
     if not seen:
         return []
     low, high = seen[0].low, seen[0].high
@@ -252,7 +254,7 @@ def _run(matter: Matter, one: report_figures.Trace) -> Markup:
 
 def residual_scan(matter: Matter) -> Markup:
     """Return the residual scan: phases, frequencies and quantities of state that the misfit goes with."""
-    found = report_figures.spots(matter.rows("residual_scan"), matter.load_unit)
+    found = report_figures.scan_rows(matter.rows("residual_scan"), matter.load_unit)
     if not found:
         return Markup("")
     rows = [
@@ -312,7 +314,7 @@ def scores(matter: Matter) -> Markup:
         return Markup("")
     rows = []
     for s in found:
-        size, least = with_error(s.get("size"), s.get("stderr")), number(s.get("detectable"), 2)
+        size, least = format_with_error(s.get("size"), s.get("stderr")), number(s.get("detectable"), 2)
         rows.append([s["effect"], number(s.get("gain")), size, percent(s.get("tolerance")), least])
     caption = (
         "At first order: the gain in log likelihood expected of each effect, the size it would have from its neutral value, "
@@ -329,7 +331,7 @@ def parameters(matter: Matter) -> Markup:
     rows, shifted = [], []
     for p in found:
         unit = unit_text(p.get("unit"))
-        before, after = (with_error(p.get(k), p.get(f"{k}_stderr")) for k in ("baseline", "augmented"))
+        before, after = (format_with_error(p.get(k), p.get(f"{k}_stderr")) for k in ("baseline", "augmented"))
         shift = p.get("shift_sigma")
         if finite(shift) and abs(shift) > SHIFTED:
             shifted.append((abs(shift), p["name"]))

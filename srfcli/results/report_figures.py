@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.diagnosis.residual_scan import SIGNIFICANT
-from srfcli.results.figures import draw_loads, envelope, imposed_scale, settle
+from srfcli.results.figures import draw_loads, envelope, fix_layout, imposed_scale
 from srfcli.results.plots import DOTTED, bare_figure, curve_style, decade_ticks, house_style, name_text, new_figure
 from srfcli.results.report_text import finite, number, with_unit
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-OBSERVED, BEFORE, AFTER, GUILTY = "#333333", "#D55E00", "#0072B2", "#E69F00"
+OBSERVED_COLOUR, BASELINE_COLOUR, AUGMENTED_COLOUR, MISFIT_COLOUR = "#333333", "#D55E00", "#0072B2", "#E69F00"
 PIECES, PIECE_SAMPLES = 60, 24  # pieces of a run whose residual is judged, samples that make a piece
 RESIDUAL_COLUMNS = 360  # in which a residual is drawn by its extremes
 DOTS = 700  # samples that are drawn one by one
@@ -73,8 +73,8 @@ class Trace:
     def sides(self, before: Array, after: Array) -> list[tuple[Array, str, Any]]:
         """Return values of baseline and augmented model, the baseline's alone where they are the same, with colour and dashes."""
         if self.same:
-            return [(before, AFTER, "-")]
-        return [(before, BEFORE, "-"), (after, AFTER, (0, (4, 1.2)))]
+            return [(before, AUGMENTED_COLOUR, "-")]
+        return [(before, BASELINE_COLOUR, "-"), (after, AUGMENTED_COLOUR, (0, (4, 1.2)))]
 
     def heights(self) -> tuple[float, ...]:
         """Return for each window how far its residual is above noise, from 0 to 1 for the worst."""
@@ -156,7 +156,7 @@ def overview(traces: Sequence[Trace], *, narrow: bool = False) -> Figure:
         )
         bar.set_label("residual / noise")
         _plain_log(bar.ax.xaxis if narrow else bar.ax.yaxis, max(3.0, top), most=5 if narrow else 8)
-        settle(figure)
+        fix_layout(figure)
         return figure
 
 
@@ -199,7 +199,7 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
                 _imposed_panel(axis, one, "W", piece)
             _end_column(near)
             axes[0].axvspan(one.t[piece][0], one.t[piece][-1], ymin=0.0, ymax=0.03, color="#000000", linewidth=0)
-        settle(figure)
+        fix_layout(figure)
         return figure
 
 
@@ -222,7 +222,7 @@ def _shade(axes: Sequence[Axes], one: Trace) -> None:
     for (a, b), height in zip(one.windows, one.heights(), strict=True):
         end = next((s for s in starts if 0 < s - b <= step), b)  # no light line between windows that adjoin
         for axis in axes:
-            axis.axvspan(a, end, color=GUILTY, alpha=0.06 + 0.26 * height, linewidth=0)
+            axis.axvspan(a, end, color=MISFIT_COLOUR, alpha=0.06 + 0.26 * height, linewidth=0)
     if one.worst is not None:
         middle = 0.5 * sum(one.worst)
         axes[1].annotate(
@@ -260,7 +260,7 @@ def _models(axis: Axes, one: Trace, part: slice) -> None:
     t = one.t[part]
     few: dict[str, Any] = {"marker": ".", "linestyle": "none", "markersize": 2.6}
     many: dict[str, Any] = {"linewidth": 0.9, "alpha": 0.75}
-    _line(axis, t, one.observed[part], label="recorded", color=OBSERVED, **(few if t.size <= DOTS else many))
+    _line(axis, t, one.observed[part], label="recorded", color=OBSERVED_COLOUR, **(few if t.size <= DOTS else many))
     names = ("baseline", "augmented model")
     for label, (values, colour, dash) in zip(names, one.sides(one.baseline, one.augmented), strict=False):
         _line(axis, t, values[part], label=label, color=colour, linewidth=1.1, linestyle=dash)
@@ -272,7 +272,7 @@ def _models(axis: Axes, one: Trace, part: slice) -> None:
 def _residual(axis: Axes, one: Trace) -> None:
     """Draw both residuals over the whole run as bands between their extremes, and where noise would stay."""
     for z, colour, _ in one.sides(one.before, one.after):
-        alpha = 0.75 if colour == AFTER else 0.55
+        alpha = 0.75 if colour == AUGMENTED_COLOUR else 0.55
         for a, b in _pieces(one.t):
             if b - a < 4 * RESIDUAL_COLUMNS:
                 axis.plot(one.t[a:b], z[a:b], color=colour, linewidth=0.6, alpha=alpha)
@@ -379,13 +379,13 @@ def _pieces(t: Array) -> list[tuple[int, int]]:
     return [(a, b) for a, b in itertools.pairwise(borders) if b > a]
 
 
-# The residual scan: its rows as `Spot`, the foremost of them, and a figure.
+# The residual scan: its rows as `ScanRow`, the foremost of them, and a figure.
 
 PANEL_BINS = 3  # of an axis, from which it has a panel of its own
 SPECTRUM_COLUMNS = 240  # columns in which a spectrum is drawn by its maxima
 THIN = 0.003  # of an axis: a bin so narrow is a line, as it would hardly be seen as a bar
 WIDE_AXIS = 100.0  # ratio from which an axis is logarithmic
-APART = ("run", "window")  # axes that the figures of the runs show
+TIME_AXES = ("run", "window")  # axes that the figures of the runs show
 
 # name: what it is in words, its unit; that of a load is the recordings'
 AXES: dict[str, tuple[str, str]] = {
@@ -406,7 +406,7 @@ ZERO_END = 1e-9  # of an interval's other end: an end below is zero
 
 
 @dataclass(frozen=True)
-class Spot:
+class ScanRow:
     """One place of the scan: an interval `low` to `high` of an axis, in a run or in all; `height` is -log10 of the p-value.
 
     `p_value` is adjusted for the number of places, `height` is not.
@@ -436,10 +436,10 @@ class Spot:
         return with_unit(f"{number(low)} to {number(high)}", self.unit)
 
 
-def spots(rows: Sequence[Mapping[str, Any]], load_unit: str) -> list[Spot]:
+def scan_rows(rows: Sequence[Mapping[str, Any]], load_unit: str) -> list[ScanRow]:
     """Return the rows of the residual scan, the least probable first; `load_unit` is N or MPa."""
     found = [
-        Spot(str(r["axis"]), str(r["run"] or ""), str(r["kind"]), float(r["low"]), float(r["high"]),
+        ScanRow(str(r["axis"]), str(r["run"] or ""), str(r["kind"]), float(r["low"]), float(r["high"]),
              -float(r["log_p"]) / math.log(10), r["p_value"],
              load_unit if r["axis"] == "W" else AXES.get(str(r["axis"]), ("", ""))[1])
         for r in rows if all(finite(r[k]) for k in ("low", "high", "log_p"))
@@ -452,9 +452,9 @@ def axis_text(axis: str) -> str:
     return AXES.get(axis, (axis, ""))[0]
 
 
-def foremost(found: Sequence[Spot], *, each: int = 2, most: int = 12) -> list[Spot]:
+def foremost(found: Sequence[ScanRow], *, each: int = 2, most: int = 12) -> list[ScanRow]:
     """Return what stands out most, `each` of an axis at most."""
-    kept: list[Spot] = []
+    kept: list[ScanRow] = []
     for spot in found:
         if sum(k.axis == spot.axis for k in kept) < each and len(kept) < most:
             kept.append(spot)
@@ -463,9 +463,9 @@ def foremost(found: Sequence[Spot], *, each: int = 2, most: int = 12) -> list[Sp
 
 def scan_figure(rows: Sequence[Mapping[str, Any]], load_unit: str, *, narrow: bool = False) -> Figure | None:
     """Return a panel for each axis of the residual scan with several bins, but runs and times; None where there is none."""
-    by_axis: dict[str, list[Spot]] = {}
-    for spot in spots(rows, load_unit):
-        if spot.axis not in APART and spot.kind != "shape":
+    by_axis: dict[str, list[ScanRow]] = {}
+    for spot in scan_rows(rows, load_unit):
+        if spot.axis not in TIME_AXES and spot.kind != "shape":
             by_axis.setdefault(spot.axis, []).append(spot)
     shown = {k: v for k, v in by_axis.items() if len({(s.low, s.high) for s in v}) >= PANEL_BINS}
     if not shown:
@@ -482,13 +482,13 @@ def scan_figure(rows: Sequence[Mapping[str, Any]], load_unit: str, *, narrow: bo
             axis.set_ylabel("−log$_{10}$ p" if k % columns == 0 else "")
         for axis in panels[len(shown) :]:
             axis.set_axis_off()
-        settle(figure)
+        fix_layout(figure)
         return figure
 
 
-def _bins(axis: Axes, found: Sequence[Spot]) -> None:
+def _bins(axis: Axes, found: Sequence[ScanRow]) -> None:
     """Draw bins along an axis, each at the largest height of any run and kind: grey what noise may do, the largest darkest."""
-    highest: dict[tuple[float, float], Spot] = {}
+    highest: dict[tuple[float, float], ScanRow] = {}
     for spot in found:  # largest first
         highest.setdefault((spot.low, spot.high), spot)
     bins = list(highest.values())
@@ -499,7 +499,7 @@ def _bins(axis: Axes, found: Sequence[Spot]) -> None:
     place = np.log if log else np.asarray
     width = float(place(max(s.high for s in bins)) - place(min(s.low for s in bins)))
     for spot in bins:
-        colour, alpha = (BEFORE if spot.sure else "#AAAAAA"), (1.0 if spot is bins[0] else 0.5)
+        colour, alpha = (BASELINE_COLOUR if spot.sure else "#AAAAAA"), (1.0 if spot is bins[0] else 0.5)
         if float(place(spot.high) - place(spot.low)) > THIN * width:
             axis.bar(spot.low, spot.height, spot.high - spot.low, align="edge", color=colour, alpha=alpha, linewidth=0)
         else:
@@ -511,11 +511,11 @@ def _bins(axis: Axes, found: Sequence[Spot]) -> None:
     axis.locator_params(axis="y", nbins=4)
 
 
-def _columns(bins: Sequence[Spot], log: bool) -> list[Spot]:
+def _columns(bins: Sequence[ScanRow], log: bool) -> list[ScanRow]:
     """Return many bins as few columns, each as high as the highest in it, largest first."""
     low, high = min(s.low for s in bins), max(s.high for s in bins)
     edges = np.geomspace(low, high, SPECTRUM_COLUMNS + 1) if log else np.linspace(low, high, SPECTRUM_COLUMNS + 1)
-    highest: dict[int, Spot] = {}
+    highest: dict[int, ScanRow] = {}
     for spot in bins:
         k = int(np.clip(np.searchsorted(edges, 0.5 * (spot.low + spot.high), side="right") - 1, 0, SPECTRUM_COLUMNS - 1))
         highest.setdefault(k, spot)
@@ -541,8 +541,8 @@ def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool =
         axis.axvspan(-2, 2, color="#DDDDDD", linewidth=0)
         axis.axvline(0, color="#777777", linewidth=0.8)
         for k, shift in enumerate(shifts):
-            axis.plot([0, shift], [k, k], color=BEFORE, linewidth=1.6)
-            axis.plot(shift, k, "o", color=BEFORE, markersize=5)
+            axis.plot([0, shift], [k, k], color=BASELINE_COLOUR, linewidth=1.6)
+            axis.plot(shift, k, "o", color=BASELINE_COLOUR, markersize=5)
         axis.set_yticks(range(len(rows)), [name_text(str(p["name"]), narrow=narrow) for p in rows])
         axis.set_ylim(-0.6, len(rows) - 0.4)
         if size > 30:
@@ -553,7 +553,7 @@ def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool =
             axis.set_xlim(*(1.6 * (end if abs(end) > 3.0 else 3.0 * side) for end, side in ((min(shifts), -1), (max(shifts), 1))))
         axis.set_xlabel("baseline less augmented model  [standard errors]")
         axis.grid(axis="y", visible=False)
-        settle(figure)
+        fix_layout(figure)
         return figure
 
 
@@ -564,9 +564,9 @@ def force_figure(name: str, force: Mapping[str, Any], load_unit: str, *, narrow:
     with house_style():
         figure, axes = new_figure(1 + len(imposed), size=(NARROW_FIGURE if narrow else 9.0, 2.6 + 1.0 * len(imposed)))
         low, high = np.asarray(force["band"], dtype=float)
-        axes[0].fill_between(t, low, high, color=AFTER, alpha=0.22, linewidth=0, label="95 % band")
+        axes[0].fill_between(t, low, high, color=AUGMENTED_COLOUR, alpha=0.22, linewidth=0, label="95 % band")
         values = np.asarray(force["force"], dtype=float)
-        axes[0].plot(*envelope(t, values), color=AFTER, linewidth=1.2, label="missing force")
+        axes[0].plot(*envelope(t, values), color=AUGMENTED_COLOUR, linewidth=1.2, label="missing force")
         axes[0].axhline(0, color="#777777", linewidth=0.8)
         axes[0].set_title(name_text(name, narrow=narrow), pad=22 if narrow else None)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=2, fontsize=8.5, borderaxespad=0.0)
@@ -581,7 +581,7 @@ def force_figure(name: str, force: Mapping[str, Any], load_unit: str, *, narrow:
         axes[-1].set_xlabel("t  [s]")
         axes[-1].set_xlim(t[0] - 0.01 * np.ptp(t), t[-1] + 0.01 * np.ptp(t))
         figure.align_ylabels(axes)
-        settle(figure)
+        fix_layout(figure)
         return figure
 
 
@@ -608,7 +608,7 @@ def force_by_state(forces: Mapping[str, Mapping[str, Any]], load_unit: str, *, n
                 decade_ticks(axis)
         axes[0].set_ylabel("missing friction coefficient")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
-        settle(figure)
+        fix_layout(figure)
         return figure
 
 
@@ -651,9 +651,12 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
         a, b = values(f"{quantity}_baseline"), values(f"{quantity}_augmented")
         return a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True)
 
-    curves = [("W0_baseline", "baseline", BEFORE, "-"), ("W0_augmented", "augmented model", AFTER, (0, (5, 1.5)))]
-    curves += [("W0_hopf_baseline", "baseline, constant load", BEFORE, DOTTED)]
-    curves += [("W0_hopf_augmented", "augmented model, constant load", AFTER, DOTTED)]
+    curves = [
+        ("W0_baseline", "baseline", BASELINE_COLOUR, "-"),
+        ("W0_augmented", "augmented model", AUGMENTED_COLOUR, (0, (5, 1.5))),
+    ]
+    curves += [("W0_hopf_baseline", "baseline, constant load", BASELINE_COLOUR, DOTTED)]
+    curves += [("W0_hopf_augmented", "augmented model, constant load", AUGMENTED_COLOUR, DOTTED)]
     if all(map(alike, ("V", "W0", "W0_hopf"))):  # nothing was added: one curve would hide the other
         curves = [(key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]]
     drawn = [c for c in curves if np.isfinite(values(c[0])).any()]
@@ -680,5 +683,5 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
         legend = axis.legend(loc="best", handlelength=2.8, title="sliding is steady below the first boundary", alignment="left")
         legend.get_title().set_color("#555555")
         decade_ticks(axis)
-        settle(figure)
+        fix_layout(figure)
         return figure

@@ -32,7 +32,7 @@ def number(value: Any, digits: int = 3) -> str:
     return _minus(f"{rounded:.{max(digits - 1 - power, 0)}f}")
 
 
-def with_error(value: Any, error: Any) -> str:
+def format_with_error(value: Any, error: Any) -> str:
     """Return `value ± error` with two digits of the error, the value to the same place."""
     if not finite(value):
         return "–"

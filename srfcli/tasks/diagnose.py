@@ -13,7 +13,7 @@ from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import BY, TRENDS, grouped
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.design import discriminating_run
-from srfcli.diagnosis.discrepancy import best_form, explain_unknown
+from srfcli.diagnosis.discrepancy import best_closed_form, explain_unknown
 from srfcli.diagnosis.residual_scan import locate
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import conclude
@@ -142,7 +142,7 @@ def diagnose(
     try:
         if verdict == "unknown":
             told("unknown: what is missing")
-            form = best_form(search, diagnosis)
+            form = best_closed_form(search, diagnosis)
         elif verdict == "ambiguous":
             told("ambiguous: the run that would tell them apart")
             discriminating = discriminating_run(registry, diagnosis, seed=seed)

@@ -543,7 +543,7 @@ def fit_thresholds(
     )  # fmt: skip
     chosen = [methods] if isinstance(methods, str) else methods
     found = thresholds.fit_thresholds(
-        system.model, table, scale=scale, values=known.values, methods=chosen or thresholds.METHODS, tol=tol, profile=profile,
+        system.model, table, scale=scale, values=known.values, methods=chosen or thresholds.FIT_METHODS, tol=tol, profile=profile,
         max_evaluations=max_evaluations or thresholds.MAX_EVALUATIONS,
         report=lambda trace: progress(f"{trace.method}, evaluation {len(trace)}: chi2 {trace.best[-1]:.6g}"),
     )  # fmt: skip

@@ -23,7 +23,7 @@ from srfcli.data.description import MOST_OBSERVABLES
 from srfcli.data.noise import FrictionField, check_gauge, generator
 from srfcli.data.values import BOUND_FACTOR, OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
 from srfcli.data.writing import stiffness_text
-from srfcli.inference.prediction import modulation_of, of_run
+from srfcli.inference.prediction import effect_inputs, modulation_of
 from srfcli.laws.law_file import RESERVED
 from srfcli.laws.registry import Registry
 from srfcli.motion import STEP_RISE
@@ -476,7 +476,7 @@ def _listed(experiment: Experiment) -> dict[str, float]:
 
 def _job(model: GeneratedModel, experiment: Experiment, run: Run, values: Mapping[str, float], start: ArrayLike | str) -> Job:
     begin = float(run.t[0])
-    asked = of_run(run) if "begin" in model.names else {}  # by effects
+    asked = effect_inputs(run) if "begin" in model.names else {}  # by effects
     found = _listed(experiment) | {"K": run.stiffness} | asked | dict(values) | experiment.elsewhere(run)
     p = model.vector({name: value for name, value in found.items() if name in model.names})
     model.check_changing_load(p)

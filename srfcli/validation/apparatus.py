@@ -9,14 +9,14 @@ from itertools import product
 
 import numpy as np
 
-from srfcli.validation.gauge import QUANTUM, REDDEST, SIGMA, Gauge
+from srfcli.validation.gauge import MAX_LAG1, QUANTUM, SIGMA, Gauge
 from srfcli.validation.slider import AGEING_LAWS, BARE, LAWS, Physics, Plan, steady_friction
 
 # How an apparatus records, and what its experimenter writes into a description: the same for every case of it.
 
 Start = tuple[float, float, float]  # value, lower, upper
 LAW_NAMES = {"Vsat": "Vsat", "lam": "lambda", "nagata": "c"}  # field of Physics -> name in a law's file, where they differ
-OF_LAW = {  # the fields of Physics that each friction law has
+LAW_FIELDS = {  # the fields of Physics that each friction law has
     "srf-vsat": ("mu0", "A", "B", "D0", "Vsat"),
     "dieterich-ruina": ("mu0", "A", "B", "D0"),
     "dieterich-cutoff": ("mu0", "A", "B", "D0", "Va", "Vsat"),
@@ -30,7 +30,7 @@ OF_LAW = {  # the fields of Physics that each friction law has
 def free_fields(baseline: Physics) -> list[str]:
     """Return the fields of a baseline that its fit has free."""
     more = [] if baseline.rigid else ["lam"]
-    return [*OF_LAW[baseline.law_name], *more, *(["nagata"] if baseline.nagata else [])]
+    return [*LAW_FIELDS[baseline.law_name], *more, *(["nagata"] if baseline.nagata else [])]
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ WRONG_AGEING = {
     ("perrin-rice-zheng", "dieterich"): 0.15,
     ("nagata", "dieterich"): 0.15,
 }
-LOADED = ("mixed", "load-steps", "oscillation")  # protocols in which the load changes
+CHANGING_LOAD_PROTOCOLS = ("mixed", "load-steps", "oscillation")  # protocols in which the load changes
 
 
 @dataclass(frozen=True)
@@ -168,10 +168,10 @@ def settings(*, wrong_ageing: bool = False) -> list[Setting]:
 Sizes = tuple[float, float, Mapping[str, tuple[float, float]]]
 FULL_TURN = (0.0, 2 * math.pi)
 # None: as the effect itself has it, that is as for the apparatus of paper; who changes those changes these.
-ALIKE_ANYWHERE = ("Vsat", "C", "slip_share", "cross", "ratio", "p_age", "D_power", "W_power", "rate_cut")
+SAME_FOR_ALL_RIGS = ("Vsat", "C", "slip_share", "cross", "ratio", "p_age", "D_power", "W_power", "rate_cut")
 SIZES: Mapping[str, Mapping[str, Sizes | None]] = {
     "rock": {
-        **dict.fromkeys(ALIKE_ANYWHERE),
+        **dict.fromkeys(SAME_FOR_ALL_RIGS),
         "alpha": (0.1, 0.5, {}),
         "lam": (20.0, 300.0, {}),
         "B2": (3e-4, 4e-3, {"D2": (60.0, 300.0)}),
@@ -195,7 +195,7 @@ SIZES: Mapping[str, Mapping[str, Sizes | None]] = {
         "dilate": (2e-4, 4e-3, {"drain": (1.0, 30.0)}),
     },
     "micro": {
-        **dict.fromkeys((*ALIKE_ANYWHERE, "drag", "topo", "ripple", "bump", "age_rate", "harden")),
+        **dict.fromkeys((*SAME_FOR_ALL_RIGS, "drag", "topo", "ripple", "bump", "age_rate", "harden")),
         "alpha": (0.005, 0.1, {}),
         "B2": (3e-4, 8e-3, {"D2": (0.4, 2.0)}),
         "Wa": (5e-4, 0.02, {}),
@@ -212,12 +212,12 @@ SIZES: Mapping[str, Mapping[str, Sizes | None]] = {
         "dilate": (5e-4, 8e-3, {"drain": (0.1, 5.0)}),
     },
 }
-BY_LOAD = {  # nothing happens without a load that changes, or what does is a change of the baseline's parameters
+NEEDS_CHANGING_LOAD = {  # nothing happens without a load that changes, or what does is a change of the baseline's parameters
     "alpha", "n_kappa", "Wa", "cross", "K_power", "poisson", "memory", "servo", "pore", "W_power",
 }  # fmt: skip
-BY_MODULATION = {"rho", "distortion"}
-OF_AGE = {"alpha", "slip_share", "p_age", "D_power", "age_rate"}  # of the one age; two have none of their own
-BESIDE_NAGATA = {"Wa", "cross", "K_power", "n_kappa", "eta", "lam"}  # the rate of the friction force does not follow then
+NEEDS_MODULATION = {"rho", "distortion"}
+NEEDS_SINGLE_AGE = {"alpha", "slip_share", "p_age", "D_power", "age_rate"}  # of the one age; two have none of their own
+EXCLUDED_WITH_NAGATA = {"Wa", "cross", "K_power", "n_kappa", "eta", "lam"}  # the rate of the friction force does not follow then
 ONE_RUN = ("rho", "distortion", "cross", "drift_t", "drift_x", "ripple", "lag", "topo")  # what may befall one run alone
 
 
@@ -226,18 +226,18 @@ def possible(varies: str, setting: Setting) -> bool:
     apparatus, protocol, law, ageing, _ = setting.apparatus, setting.protocol, setting.law, setting.ageing, setting.stated
     rules = (
         apparatus == "paper" or varies in SIZES[apparatus],
-        varies not in BY_LOAD or protocol in LOADED,
-        varies != "lam" or apparatus == "paper" or protocol in LOADED,
-        varies not in BY_MODULATION or (apparatus, protocol) == ("paper", "mixed"),
+        varies not in NEEDS_CHANGING_LOAD or protocol in CHANGING_LOAD_PROTOCOLS,
+        varies != "lam" or apparatus == "paper" or protocol in CHANGING_LOAD_PROTOCOLS,
+        varies not in NEEDS_MODULATION or (apparatus, protocol) == ("paper", "mixed"),
         varies != "Vsat" or law == "dieterich-ruina",
         varies != "C" or law == "srf-vsat",
-        varies not in {"B2", *OF_AGE} or law != "two-state",
+        varies not in {"B2", *NEEDS_SINGLE_AGE} or law != "two-state",
         varies != "slip_share" or ageing in ("dieterich", "perrin-rice-zheng"),
         varies != "p_age" or ageing == "dieterich",
         varies != "dilate" or (ageing in ("dieterich", "ruina") and law != "two-state"),  # an age of D0/V
         varies != "rate_cut" or law not in ("dieterich-cutoff", "rice-regularized"),
         varies != "M" or protocol != "stick-slip",  # which a quasi-static baseline does not have
-        varies not in BESIDE_NAGATA or ageing != "nagata",
+        varies not in EXCLUDED_WITH_NAGATA or ageing != "nagata",
     )
     return all(rules)
 
@@ -276,7 +276,7 @@ def critical_spring(p: Physics, plan: Plan) -> float:
     return found
 
 
-def _log(rng: np.random.Generator, low: float, high: float) -> float:
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(f"{math.exp(rng.uniform(math.log(low), math.log(high))):.3g}")
 
 
@@ -289,18 +289,18 @@ def _slider(rng: np.random.Generator, setting: Setting) -> tuple[Physics, float]
         p = replace(usual, **around)
     elif setting.apparatus == "rock":
         A = float(rng.uniform(0.005, 0.012))
-        mu, load = float(rng.uniform(0.58, 0.72)), _log(rng, 5, 100)
+        mu, load = float(rng.uniform(0.58, 0.72)), _log_uniform(rng, 5, 100)
         p = Physics(
-            K=_log(rng, 0.01, 0.08), M=0.0, A=A, B=A + float(rng.uniform(-0.004, 0.004)), D0=_log(rng, 10, 50),
-            Vsat=_log(rng, 500, 3000), rigid=True, massless=True,
+            K=_log_uniform(rng, 0.01, 0.08), M=0.0, A=A, B=A + float(rng.uniform(-0.004, 0.004)), D0=_log_uniform(rng, 10, 50),
+            Vsat=_log_uniform(rng, 500, 3000), rigid=True, massless=True,
         )  # fmt: skip
     else:
         A = float(rng.uniform(0.006, 0.014))
-        mu, load = float(rng.uniform(0.28, 0.5)), _log(rng, 0.04, 0.6)
+        mu, load = float(rng.uniform(0.28, 0.5)), _log_uniform(rng, 0.04, 0.6)
         more = rng.uniform(0.003, 0.01) if setting.protocol == "stick-slip" else rng.uniform(-0.005, 0.002)
         p = Physics(
-            K=_log(rng, 2e-3, 1e-2), M=_log(rng, 0.5, 5) * 1e-9, A=A, B=A + float(more), D0=_log(rng, 0.03, 0.15),
-            Vsat=_log(rng, 150, 1500), rigid=True,
+            K=_log_uniform(rng, 2e-3, 1e-2), M=_log_uniform(rng, 0.5, 5) * 1e-9, A=A, B=A + float(more),
+            D0=_log_uniform(rng, 0.03, 0.15), Vsat=_log_uniform(rng, 150, 1500), rigid=True,
         )  # fmt: skip
     return replace(with_laws(p, mu, rng, setting), Wref=load), load
 
@@ -311,7 +311,7 @@ def with_laws(p: Physics, mu: float, rng: np.random.Generator, setting: Setting)
     short = "" if law in ("srf-vsat", "dieterich-ruina") else law
     p = replace(p, law=short, bare=bare, mu0=mu if bare else mu - p.B * math.log1p(p.Vsat / p.V0))
     if law == "dieterich-cutoff":
-        Va = _log(rng, 2e3, 3e4)
+        Va = _log_uniform(rng, 2e3, 3e4)
         p = replace(p, Va=Va, mu0=p.mu0 + p.A * math.log(Va / p.V0))
     elif law == "log-log":
         p = replace(p, C=float(rng.uniform(0.02, 0.07)) * p.A)
@@ -324,7 +324,7 @@ def with_laws(p: Physics, mu: float, rng: np.random.Generator, setting: Setting)
 
 
 @dataclass(frozen=True)
-class _Pace:
+class _DriveSettings:
     """How a rig is driven and read."""
 
     slow: tuple[float, float]  # um/s, the velocities from which steps go up
@@ -338,17 +338,17 @@ class _Pace:
     jump: tuple[float, float] = (0.1, 0.3)  # of the load, relative
 
 
-PACES: Mapping[str, _Pace] = {
-    "paper": _Pace((4.0, 8.0), 12.0, (0.002, 0.02), 0.03, (3.0, 10.0), 0.4, (4.0, 1.0, 8.0)),
-    "rock": _Pace((0.8, 30.0), 160.0, (0.01, 0.1), 0.5, (10.0, 30.0, 100.0), 20.0, least=4.0),
-    "micro": _Pace((2.0, 10.0), 12.0, (0.002, 0.02), 0.05, (5.0, 20.0), 0.08),
+DRIVE_SETTINGS: Mapping[str, _DriveSettings] = {
+    "paper": _DriveSettings((4.0, 8.0), 12.0, (0.002, 0.02), 0.03, (3.0, 10.0), 0.4, (4.0, 1.0, 8.0)),
+    "rock": _DriveSettings((0.8, 30.0), 160.0, (0.01, 0.1), 0.5, (10.0, 30.0, 100.0), 20.0, least=4.0),
+    "micro": _DriveSettings((2.0, 10.0), 12.0, (0.002, 0.02), 0.05, (5.0, 20.0), 0.08),
 }
 LONGEST_RUN = 6000  # samples, unless the largest interval is too short for that
 
 
 def _runs(rng: np.random.Generator, setting: Setting, load: float) -> tuple[Plan, ...]:
     """Return the runs of a protocol, two to fit and one held out, but for a single run of steps and the five of a mixed one."""
-    pace, protocol = PACES[setting.apparatus], setting.protocol
+    pace, protocol = DRIVE_SETTINGS[setting.apparatus], setting.protocol
     made: tuple[Plan, ...]
     if protocol == "steps":
         return (_steps("steps", pace, rng, load),)
@@ -368,7 +368,7 @@ def _runs(rng: np.random.Generator, setting: Setting, load: float) -> tuple[Plan
     return (*made[:-1], replace(made[-1], holdout=True))
 
 
-def _finished(plan: Plan, pace: _Pace, fastest: float) -> Plan:
+def _sampled(plan: Plan, pace: _DriveSettings, fastest: float) -> Plan:
     """Return a run sampled as its velocities and its length ask for."""
     wanted = max(pace.length / (10 * fastest), plan.duration / LONGEST_RUN)
     if plan.eps:
@@ -377,62 +377,62 @@ def _finished(plan: Plan, pace: _Pace, fastest: float) -> Plan:
     return replace(plan, interval=interval, rise=pace.rise)
 
 
-def _piece(pace: _Pace, V: float) -> tuple[float, float]:
+def _drive_piece(pace: _DriveSettings, V: float) -> tuple[float, float]:
     """Return a piece of the drive, (s, um/s), that slides the usual distance."""
     return float(f"{max(pace.distance / V, pace.least):.2g}"), V
 
 
-def _near(rng: np.random.Generator, value: float, spread: float) -> float:
+def _perturbed(rng: np.random.Generator, value: float, spread: float) -> float:
     return float(f"{value * (1 + rng.uniform(-spread, spread)):.3g}")
 
 
-def _steps(name: str, pace: _Pace, rng: np.random.Generator, load: float) -> Plan:
+def _steps(name: str, pace: _DriveSettings, rng: np.random.Generator, load: float) -> Plan:
     """Three steps of velocity."""
-    V = _log(rng, *pace.slow)
+    V = _log_uniform(rng, *pace.slow)
     velocities = [V, *(float(f"{V * factor:.3g}") for factor in pace.steps)]
-    plan = Plan(name, tuple(_piece(pace, v) for v in velocities), load, 1.0)
-    return _finished(plan, pace, max(velocities))
+    plan = Plan(name, tuple(_drive_piece(pace, v) for v in velocities), load, 1.0)
+    return _sampled(plan, pace, max(velocities))
 
 
-def _holds(name: str, pace: _Pace, rng: np.random.Generator, load: float) -> Plan:
+def _holds(name: str, pace: _DriveSettings, rng: np.random.Generator, load: float) -> Plan:
     """Slide, hold, slide: the drive stands still for ever longer."""
-    V = _log(rng, max(pace.slow[0], 0.3 * pace.slow[1]), pace.slow[1])
-    drive = [_piece(pace, V)]
+    V = _log_uniform(rng, max(pace.slow[0], 0.3 * pace.slow[1]), pace.slow[1])
+    drive = [_drive_piece(pace, V)]
     for hold in pace.holds:
-        drive += [(_near(rng, hold, 0.2), 0.0), _piece(pace, V)]
-    return _finished(Plan(name, tuple(drive), load, 1.0), pace, V)
+        drive += [(_perturbed(rng, hold, 0.2), 0.0), _drive_piece(pace, V)]
+    return _sampled(Plan(name, tuple(drive), load, 1.0), pace, V)
 
 
-def _load_steps(name: str, pace: _Pace, rng: np.random.Generator, load: float) -> Plan:
+def _load_steps(name: str, pace: _DriveSettings, rng: np.random.Generator, load: float) -> Plan:
     """The load goes up, back, up by more and back."""
-    V = _log(rng, max(pace.slow[0], 0.2 * pace.slow[1]), pace.slow[1])
-    base = _near(rng, load, 0.2)
-    wait = max(_piece(pace, V)[0], 8 * pace.rise)
+    V = _log_uniform(rng, max(pace.slow[0], 0.2 * pace.slow[1]), pace.slow[1])
+    base = _perturbed(rng, load, 0.2)
+    wait = max(_drive_piece(pace, V)[0], 8 * pace.rise)
     sizes = [float(f"{base * rng.uniform(*pace.jump) * more:.3g}") for more in (1.0, 1.5)]
     jumps = (sizes[0], -sizes[0], sizes[1], -sizes[1])
     at = [float(f"{wait * (k + 1) * (1 + rng.uniform(-0.05, 0.05)):.3g}") for k in range(4)]
     plan = Plan(name, ((float(f"{5 * wait:.2g}"), V),), base, 1.0, steps=tuple(zip(at, jumps, strict=True)))
-    return _finished(plan, pace, V)
+    return _sampled(plan, pace, V)
 
 
-def _oscillation(name: str, pace: _Pace, rng: np.random.Generator, load: float) -> Plan:
+def _oscillation(name: str, pace: _DriveSettings, rng: np.random.Generator, load: float) -> Plan:
     """The load oscillates slowly, with a period of 0.5 to 50 s, from some time on."""
-    V = _log(rng, max(pace.slow[0], 0.3 * pace.slow[1]), pace.slow[1])
-    period = _log(rng, 0.5, 50)
-    rest = max(_piece(pace, V)[0], 0.3 * period)
+    V = _log_uniform(rng, max(pace.slow[0], 0.3 * pace.slow[1]), pace.slow[1])
+    period = _log_uniform(rng, 0.5, 50)
+    rest = max(_drive_piece(pace, V)[0], 0.3 * period)
     duration = rest + max((8 if period < 10 else 3) * period, pace.distance / V)
     eps, onset = float(f"{rng.uniform(0.05, 0.2):.2g}"), float(f"{rest:.2g}")
-    plan = Plan(name, ((float(f"{duration:.2g}"), V),), _near(rng, load, 0.1), 1.0, eps=eps, f=1 / period, onset=onset)
-    return replace(_finished(plan, pace, V), rise=float(f"{max(0.1 * period, pace.rise):.2g}"))
+    plan = Plan(name, ((float(f"{duration:.2g}"), V),), _perturbed(rng, load, 0.1), 1.0, eps=eps, f=1 / period, onset=onset)
+    return replace(_sampled(plan, pace, V), rise=float(f"{max(0.1 * period, pace.rise):.2g}"))
 
 
 def _stick_slip(name: str, setting: Setting, rng: np.random.Generator, load: float) -> Plan:
     """A drive slow enough, under a load large enough, that the slider sticks and slips."""
     if setting.apparatus == "paper":
-        drive = ((0.5, _near(rng, 12, 0.15)), (5.0, _near(rng, 8, 0.3)))
-        return Plan(name, drive, _near(rng, 9.5, 0.06), 0.004)
-    drive = ((1.0, _log(rng, 3, 6)), (8.0, _log(rng, 1, 5)))
-    return Plan(name, drive, _near(rng, load, 0.2), 0.004)
+        drive = ((0.5, _perturbed(rng, 12, 0.15)), (5.0, _perturbed(rng, 8, 0.3)))
+        return Plan(name, drive, _perturbed(rng, 9.5, 0.06), 0.004)
+    drive = ((1.0, _log_uniform(rng, 3, 6)), (8.0, _log_uniform(rng, 1, 5)))
+    return Plan(name, drive, _perturbed(rng, load, 0.2), 0.004)
 
 
 # The gauge of a rig, and the kind of noise that it has.
@@ -447,7 +447,7 @@ def draw_gauge(rng: np.random.Generator, rig: str, p: Physics, noise: str) -> Ga
     else:
         sigma = float(np.exp(rng.uniform(*np.log((0.008, 0.03))))) * (p.K * 1e3 if rig == "micro-force" else 1.0)
     quantum = QUANTUM if rig == "paper" else 10.0 ** math.floor(math.log10(sigma / 2))
-    lag1, pink = float(rng.uniform(0.3, REDDEST)), float(rng.uniform(0.3, 0.9))
+    lag1, pink = float(rng.uniform(0.3, MAX_LAG1)), float(rng.uniform(0.3, 0.9))
     spikes = int(rng.integers(1, 4))
     return Gauge(
         float(f"{sigma:.3g}"), lag1 if noise == "ar1" else 0.0, quantum, pink if noise == "1/f" else 0.0,

@@ -117,7 +117,7 @@ def write_answers(path: Path, answers: Iterable[Answer]) -> None:
 # The diagnosis of one case. Nothing here can reach a truth.
 
 Diagnose = Callable[[Path, tuple[Path, ...]], Answer]  # folder of a case, folders of plugins
-ELSEWHERE = ("cli", "results", "validation")  # parts of the package that no answer depends on
+IRRELEVANT_FOLDERS = ("cli", "results", "validation")  # parts of the package that no answer depends on
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Task:
     limit: float
 
 
-class _TooLong(BaseException):  # not an Exception, so that no handler inside the diagnosis catches it
+class _TimeLimitExceeded(BaseException):  # not an Exception, so that no handler inside the diagnosis catches it
     pass
 
 
@@ -145,7 +145,7 @@ def answer_case(task: Task) -> Answer:
         last = traceback.extract_tb(error.__traceback__)[-1]
         place = f"{Path(last.filename).name}, line {last.lineno}"
         found = failed(task.folder.name, f"{type(error).__name__}: {error}; {place}")
-    except _TooLong:
+    except _TimeLimitExceeded:
         found = failed(task.folder.name, f"more than {task.limit:g} s of CPU")
     cpu, wall = round(_cpu() - used, 3), round(time.perf_counter() - begun, 3)
     return replace(found, case=task.folder.name, code=code_of(task.plugins), cpu=cpu, wall=wall)
@@ -168,13 +168,13 @@ def diagnose_case(folder: Path, plugins: tuple[Path, ...], *, by: type[ModelSear
     registry = _registry(plugins)
     search = (by or ModelSearch)(registry, read_experiment(folder, registry=registry, holdout=False))
     search.run()
-    return told(conclude(search, read_experiment(folder, registry=registry)), registry, case=folder.name)
+    return answer_of(conclude(search, read_experiment(folder, registry=registry)), registry, case=folder.name)
 
 
-OFF_RANGE = (0.1, 1 / 3, 3.0, 10.0)  # times the slowest, the fastest drive: where critical loads are asked for
+EXTRAPOLATION_FACTORS = (0.1, 1 / 3, 3.0, 10.0)  # times the slowest, the fastest drive: where critical loads are asked for
 
 
-def told(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
+def answer_of(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
     """Return a diagnosis as an answer."""
     from srfcli.diagnosis.answer import run_views
     from srfcli.diagnosis.verdict import added
@@ -190,7 +190,10 @@ def told(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
         tuple(tuple(names) for names in diagnosis.equivalent),
         tuple(dict.fromkeys(x.effect for x in diagnosis.not_identifiable)),
         {name: {k: _finite(v) for k, v in value.items()} for name, value in added(diagnosis.best, diagnosis.baseline).items()},
-        {"baseline": _finite(diagnosis.shown.fit.maximum.point.rms), "augmented": _finite(diagnosis.best.fit.maximum.point.rms)},
+        {
+            "baseline": _finite(diagnosis.reported_baseline.fit.maximum.point.rms),
+            "augmented": _finite(diagnosis.best.fit.maximum.point.rms),
+        },
         {view.run.name: _errors(view) for view in views if view.run.holdout},
         {_plain(f.name): _evidence(f) for f in reversed(diagnosis.ranked)},
         diagnosis.ungated,
@@ -205,7 +208,7 @@ def _critical_loads(diagnosis: Diagnosis, registry: Registry) -> Mapping[str, Se
 
     driven = np.concatenate([np.abs(run.drive.velocities) for run in diagnosis.experiment.runs])
     slowest, fastest = driven[driven > 0].min(), driven.max()
-    V = np.array([x * (slowest if x < 1 else fastest) for x in OFF_RANGE])
+    V = np.array([x * (slowest if x < 1 else fastest) for x in EXTRAPOLATION_FACTORS])
     try:
         found = {name: critical_loads(registry, f, V) for name, f in
                  (("baseline", diagnosis.baseline), ("augmented", diagnosis.best))}  # fmt: skip
@@ -258,7 +261,7 @@ def _registry(plugins: tuple[Path, ...]) -> Registry:
 def code_of(plugins: tuple[Path, ...]) -> str:
     """Return twelve digits that change with any file of the package, or of `plugins`, on which an answer depends."""
     package = Path(__file__).resolve().parents[1]
-    parts = [p for p in sorted(package.iterdir()) if p.name not in ELSEWHERE]
+    parts = [p for p in sorted(package.iterdir()) if p.name not in IRRELEVANT_FOLDERS]
     whole = hashlib.sha256()
     for place in (*parts, package.parent / "plugins", *plugins):
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
@@ -275,13 +278,13 @@ def _cpu() -> float:
 
 @contextmanager
 def _limited(seconds: float) -> Iterator[None]:
-    """Raise _TooLong in what is done inside once this process has used `seconds` of CPU for it."""
+    """Raise _TimeLimitExceeded in what is done inside once this process has used `seconds` of CPU for it."""
     if sys.platform == "win32":  # it has no such clock
         yield
         return
 
     def stop(number: int, frame: Any) -> None:
-        raise _TooLong
+        raise _TimeLimitExceeded
 
     before = signal.signal(signal.SIGPROF, stop)
     signal.setitimer(signal.ITIMER_PROF, seconds)

@@ -33,7 +33,7 @@ from srfcli.validation.apparatus import (
     recorded,
     settings,
 )
-from srfcli.validation.gauge import REDDEST, Array, Gauge, play, read_gauge
+from srfcli.validation.gauge import MAX_LAG1, Array, Gauge, play, read_gauge
 from srfcli.validation.slider import SMOOTH, Physics, Plan, Track, move
 
 # What can be concealed: each effect, how strong it is drawn, and what the baseline is that lacks it.
@@ -176,9 +176,16 @@ TRACKS = {"smooth": (False, False), "shared": (True, False), "rough": (True, Tru
 KIND_SHARES = (0.25, 0.4, 0.15, 0.2)  # of the kinds, where none is asked for
 WIDE_SHARES = (0.25, 0.3, 0.1, 0.13, 0.14, 0.08)
 START_SCATTER = {"A": 0.05, "B": 0.05, "D0": 0.05, "lam": 0.05, "Vsat": 0.13, "mu0": 0.01}  # relative standard deviations
-ODD = ("rigid", "massless", "bare")  # baselines other than the usual one
-ODD_SHARE = 0.15  # of the cases where no effect decides it: else an odd baseline would give the answer away
-USUAL_ONLY = {"stiffness-exponent", "log-log-coupling", "interface-damping", "interface-compliance", "inertia", "age-saturation"}
+NONSTANDARD_BASELINES = ("rigid", "massless", "bare")  # baselines other than the usual one
+NONSTANDARD_SHARE = 0.15  # of the cases where no effect decides it: else an odd baseline would give the answer away
+STANDARD_BASELINE_ONLY = {
+    "stiffness-exponent",
+    "log-log-coupling",
+    "interface-damping",
+    "interface-compliance",
+    "inertia",
+    "age-saturation",
+}
 ROUGH_SHARE, WHITE_SHARE = 0.4, 0.6
 OWN_SHARE = 0.5  # of cases with a field: each run has its own
 ROUGHNESS, CORRELATION = (5e-5, 4e-4), (3.0, 30.0)  # of mu0; um
@@ -217,7 +224,7 @@ def without(p: Physics, effects: Sequence[Effect]) -> Physics:
 
 
 @dataclass(frozen=True)
-class Asked:
+class CaseRequest:
     """What a case is asked to be; what is None is drawn.
 
     `kind` is none, single, pair or outside, in the wide bank also ageing or one-run; `effects` are names. `size` from 0 to 1 is
@@ -235,71 +242,73 @@ class Asked:
     noise: str | None = None
 
 
-NOTHING = Asked()
+NO_REQUEST = CaseRequest()
 
 
-def draw_recipe(rng: np.random.Generator, asked: Asked = NOTHING) -> Recipe:
+def draw_recipe(rng: np.random.Generator, request: CaseRequest = NO_REQUEST) -> Recipe:
     """Return the case that `rng` gives."""
-    chosen = _chosen(rng, asked)
-    sizes = _sizes(rng, len(chosen), asked.size)
-    physics = _laws(rng, chosen)
-    track = _track(rng, asked.rough)
+    chosen = _draw_effects(rng, request)
+    sizes = _draw_sizes(rng, len(chosen), request.size)
+    physics = _draw_baseline(rng, chosen)
+    track = _draw_track(rng, request.rough)
     for effect, strength in zip(chosen, sizes, strict=True):
         physics = effect.added(physics, rng, strength)
     physics = replace(physics, track=track)
     baseline = without(physics, chosen)
-    plans = asked.plans or draw_protocol(rng)
-    lag1 = float(rng.uniform(0.3, REDDEST))
+    plans = request.plans or draw_protocol(rng)
+    lag1 = float(rng.uniform(0.3, MAX_LAG1))
     gauge = Gauge(lag1=0.0 if rng.uniform() < WHITE_SHARE else lag1)
     drawn_own = rng.uniform() < OWN_SHARE
-    if track.size and (drawn_own if asked.own is None else asked.own):
+    if track.size and (drawn_own if request.own is None else request.own):
         physics, baseline = (replace(p, track=replace(track, own=True)) for p in (physics, baseline))
     noise = "ar1" if gauge.lag1 else "white"
-    return Recipe(chosen, sizes, physics, baseline, plans, gauge, kind_of(chosen), noise=noise)
+    return Recipe(chosen, sizes, physics, baseline, plans, gauge, kind_of_effects(chosen), noise=noise)
 
 
-def kind_of(effects: Sequence[Effect]) -> str:
+def kind_of_effects(effects: Sequence[Effect]) -> str:
     """Return the kind of a case that conceals these effects in all of its runs."""
     return ("none", "single", "pair")[len(effects)] if all(e.listed for e in effects) else "outside"
 
 
-def draw_wide(rng: np.random.Generator, asked: Asked = NOTHING) -> Recipe:
+def draw_wide(rng: np.random.Generator, request: CaseRequest = NO_REQUEST) -> Recipe:
     """Return the case of the wide bank that `rng` gives.
 
     Apparatus, protocol, laws and noise are among those in which the effects make sense, effects asked for those that the kind
     wants.
     """
-    kind, effects = asked.kind, asked.effects
+    kind, effects = request.kind, request.effects
     if kind is None and effects is not None:
-        kind = kind_of([e for name in effects for e in variants(name)[:1]])
+        kind = kind_of_effects([e for name in effects for e in variants(name)[:1]])
     kind = str(rng.choice(WIDE_KINDS, p=WIDE_SHARES)) if kind is None else kind
     check_kinds((kind,), "wide")
-    names = wide_names(rng, kind) if effects is None else tuple(effects)
-    forms, setting = _set(rng, kind, names, [asked.setting] if asked.setting else settings(wrong_ageing=kind == "ageing"))
+    names = draw_effect_names(rng, kind) if effects is None else tuple(effects)
+    forms, setting = _forms_and_setting(
+        rng, kind, names, [request.setting] if request.setting else settings(wrong_ageing=kind == "ageing")
+    )
     physics, plans = draw_setup(rng, setting)
-    plans = asked.plans or plans or draw_protocol(rng)
-    if setting.apparatus == "paper" and rng.uniform() < ODD_SHARE and _may_be_odd(forms, setting):
+    plans = request.plans or plans or draw_protocol(rng)
+    if setting.apparatus == "paper" and rng.uniform() < NONSTANDARD_SHARE and _allows_nonstandard_baseline(forms, setting):
         which = str(rng.choice(("rigid", "massless")))
         physics = replace(physics, rigid=which == "rigid", massless=which == "massless")
-    sizes = _sizes(rng, len(forms), asked.size)
+    sizes = _draw_sizes(rng, len(forms), request.size)
     for effect, strength in zip(forms, sizes, strict=True):
         physics = effect.present(effect.added(physics, rng, strength), physics)
-    track = _track(rng, asked.rough)
+    track = _draw_track(rng, request.rough)
     if track.size and setting.apparatus == "rock":
         track = replace(track, length=ROCK_CORRELATION * track.length)
     drawn_own = rng.uniform() < OWN_SHARE
-    physics = replace(physics, track=replace(track, own=bool(track.size) and (drawn_own if asked.own is None else asked.own)))
+    physics = replace(physics, track=replace(track, own=bool(track.size) and (drawn_own if request.own is None else request.own)))
     if kind == "ageing":
         forms, sizes = (other_ageing(setting.ageing, setting.stated),), (1.0,)
-    noise = asked.noise or str(rng.choice(list(NOISE_SHARES), p=list(NOISE_SHARES.values())))
+    noise = request.noise or str(rng.choice(list(NOISE_SHARES), p=list(NOISE_SHARES.values())))
     plans = disturbed(rng, plans, noise)
     rig = str(rng.choice([name for name in RIGS if name.partition("-")[0] == setting.apparatus]))
     gauge = draw_gauge(rng, rig, physics, noise)
-    only = str(rng.choice(_runs_of(forms[0], plans))) if kind == "one-run" else ""
+    only = str(rng.choice(_runs_that_show(forms[0], plans))) if kind == "one-run" else ""
     return Recipe(forms, sizes, physics, without(physics, forms), plans, gauge, kind, rig, setting.protocol, noise, only)
 
 
-def wide_names(rng: np.random.Generator, kind: str) -> tuple[str, ...]:
+def draw_effect_names(rng: np.random.Generator, kind: str) -> tuple[str, ...]:
     """Return the effects of a case of the wide bank, by its kind."""
     if kind == "pair":
         pairs = possible_pairs()
@@ -308,7 +317,7 @@ def wide_names(rng: np.random.Generator, kind: str) -> tuple[str, ...]:
     return (str(rng.choice(known)),) if known else ()
 
 
-def _set(
+def _forms_and_setting(
     rng: np.random.Generator, kind: str, names: Sequence[str], every: Sequence[Setting]
 ) -> tuple[tuple[Effect, ...], Setting]:
     """Return the effects in forms and sizes of a setting in which they make sense, and the setting, one of these."""
@@ -332,13 +341,13 @@ def _forms(rng: np.random.Generator, names: Sequence[str]) -> tuple[Effect, ...]
     return tuple(forms[int(rng.integers(len(forms)))] for forms in [variants(name) for name in names])
 
 
-def _may_be_odd(forms: Sequence[Effect], setting: Setting) -> bool:
+def _allows_nonstandard_baseline(forms: Sequence[Effect], setting: Setting) -> bool:
     """Return whether a rigid or quasi-static baseline can be followed, and gives nothing away."""
-    decided = any(e.name in USUAL_ONLY for e in forms)
+    decided = any(e.name in STANDARD_BASELINE_ONLY for e in forms)
     return not decided and setting.protocol not in ("mixed", "stick-slip") and "nagata" not in (setting.ageing, setting.stated)
 
 
-def _runs_of(effect: Effect, plans: Sequence[Plan]) -> list[str]:
+def _runs_that_show(effect: Effect, plans: Sequence[Plan]) -> list[str]:
     """Return the fitted runs in which an effect can act."""
     fitted = [p for p in plans if not p.holdout]
     if effect.varies in ("rho", "distortion"):
@@ -360,7 +369,7 @@ def other_ageing(true: str, stated: str) -> Effect:
     return Effect(true, "ageing", 1.0, 1.0, absent={"ageing": stated, "nagata": 0.0})
 
 
-def _sizes(rng: np.random.Generator, count: int, asked: float | None) -> tuple[float, ...]:
+def _draw_sizes(rng: np.random.Generator, count: int, asked: float | None) -> tuple[float, ...]:
     """Return how strong each of the effects is."""
     if asked is not None and not 0 <= asked <= 1:
         raise SrfError(f"size = {asked:g} of an effect", "give a number from 0, hardly there, to 1, strong")
@@ -368,33 +377,33 @@ def _sizes(rng: np.random.Generator, count: int, asked: float | None) -> tuple[f
     return tuple(drawn if asked is None else [asked] * count)
 
 
-def _chosen(rng: np.random.Generator, asked: Asked) -> tuple[Effect, ...]:
+def _draw_effects(rng: np.random.Generator, request: CaseRequest) -> tuple[Effect, ...]:
     """Return the effects by name, or as many as the kind has."""
     drawn_kind = str(rng.choice(PAPER_KINDS, p=KIND_SHARES))
     order = [str(n) for n in rng.permutation(NAMES)]
     outside = str(rng.choice(OUTSIDE_NAMES))
-    names = asked.effects
+    names = request.effects
     if names is None:
-        kind = drawn_kind if asked.kind is None else asked.kind
+        kind = drawn_kind if request.kind is None else request.kind
         check_kinds((kind,), "paper")
         names = {"none": [], "single": order[:1], "pair": order[:2], "outside": [outside]}[kind]
     return _forms(rng, names)
 
 
-def _laws(rng: np.random.Generator, chosen: Sequence[Effect]) -> Physics:
+def _draw_baseline(rng: np.random.Generator, chosen: Sequence[Effect]) -> Physics:
     """Return the laws' numbers, and now and then a baseline that is rigid, quasi-static or without a cut-off of age."""
     usual = Physics()
     numbers = {n: getattr(usual, n) * float(np.exp(s * rng.standard_normal())) for n, s in START_SCATTER.items()}
-    odd, which = rng.uniform() < ODD_SHARE, str(rng.choice(ODD))
+    odd, which = rng.uniform() < NONSTANDARD_SHARE, str(rng.choice(NONSTANDARD_BASELINES))
     physics = replace(usual, **numbers)
-    if not odd or any(effect.name in USUAL_ONLY for effect in chosen):
+    if not odd or any(effect.name in STANDARD_BASELINE_ONLY for effect in chosen):
         return physics
     if which == "bare":
         return replace(physics, bare=True, mu0=physics.mu0 + physics.B * float(np.log(physics.Vsat / physics.V0)))
     return replace(physics, rigid=which == "rigid", massless=which == "massless")
 
 
-def _track(rng: np.random.Generator, rough: bool | float | None) -> Track:
+def _draw_track(rng: np.random.Generator, rough: bool | float | None) -> Track:
     is_rough = rng.uniform() < ROUGH_SHARE
     size = float(np.exp(rng.uniform(*np.log(ROUGHNESS))))
     length, seed = float(np.exp(rng.uniform(*np.log(CORRELATION)))), int(rng.integers(2**32))
@@ -500,15 +509,15 @@ Truth = dict[str, Any]
 def make_case(folder: Path, seed: int | Sequence[int], *, bank: str = "paper", **asked: Any) -> Truth:
     """Write a concealed experiment to the new folder `folder` and return the truth about it, ready for JSON.
 
-    What is `asked` for are fields of `Asked`. The same seed and choices give the same bytes. Raises SrfError for unknown names of
-    effects, kinds and banks, and where the folder exists.
+    What is `asked` for are fields of `CaseRequest`. The same seed and choices give the same bytes. Raises SrfError for unknown
+    names of effects, kinds and banks, and where the folder exists.
     """
     if folder.exists():
         raise SrfError(f"{folder} exists already", "A case is never overwritten; name another folder.")
     if bank not in BANKS:
         raise SrfError(f"unknown bank '{bank}'", did_you_mean(bank, BANKS))
-    recipe, motions, attempt = _moving(seed, draw_wide if bank == "wide" else draw_recipe, Asked(**asked))
-    rng, rig = np.random.default_rng([*_whole(seed), attempt, 1]), RIGS[recipe.rig]
+    recipe, motions, attempt = _integrable_recipe(seed, draw_wide if bank == "wide" else draw_recipe, CaseRequest(**asked))
+    rng, rig = np.random.default_rng([*_seed_sequence(seed), attempt, 1]), RIGS[recipe.rig]
     readings = {
         plan: read_gauge(recorded(rig, recipe.acting(plan), plan, u), recipe.gauge.louder(plan.loud), rng)
         for plan, u in motions.items()
@@ -521,19 +530,19 @@ def make_case(folder: Path, seed: int | Sequence[int], *, bank: str = "paper", *
     return truth
 
 
-def _whole(seed: int | Sequence[int]) -> list[int]:
+def _seed_sequence(seed: int | Sequence[int]) -> list[int]:
     return [seed] if isinstance(seed, int) else list(seed)
 
 
-def _moving(
-    seed: int | Sequence[int], draw: Callable[[np.random.Generator, Asked], Recipe], asked: Asked
+def _integrable_recipe(
+    seed: int | Sequence[int], draw: Callable[[np.random.Generator, CaseRequest], Recipe], request: CaseRequest
 ) -> tuple[Recipe, dict[Plan, Array], int]:
     """Return the first recipe of the seed whose runs all reach their ends, what their gauges show, and how many came before."""
     for attempt in range(REDRAWS):
-        recipe = draw(np.random.default_rng([*_whole(seed), attempt, 0]), asked)
+        recipe = draw(np.random.default_rng([*_seed_sequence(seed), attempt, 0]), request)
         motions: dict[Plan, Array] = {}
         for plan in recipe.plans:
-            u = shown(recipe.acting(plan), plan)
+            u = noiseless_elongation(recipe.acting(plan), plan)
             if not np.isfinite(u).all():
                 break
             motions[plan] = u
@@ -544,15 +553,15 @@ def _moving(
     )
 
 
-def shown(p: Physics, plan: Plan) -> Array:
+def noiseless_elongation(p: Physics, plan: Plan) -> Array:
     """Return the elongations that a slider's gauge would show (n,) in um without noise; NaN from where it cannot be followed."""
     u = move(p, plan).u
     return play(u, p.backlash) if p.backlash else u
 
 
-def unread(rig: Rig, p: Physics, plan: Plan) -> Array:
+def noiseless_record(rig: Rig, p: Physics, plan: Plan) -> Array:
     """Return what a rig would record (n,) without noise; NaN from where the slider cannot be followed."""
-    return recorded(rig, p, plan, shown(p, plan))
+    return recorded(rig, p, plan, noiseless_elongation(p, plan))
 
 
 def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
@@ -579,7 +588,7 @@ def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
         "own_track": recipe.physics.track.own,
         "gauge": asdict(recipe.gauge),
         "runs": [asdict(plan) for plan in recipe.plans],
-        "seed": _whole(seed),
+        "seed": _seed_sequence(seed),
         "attempt": attempt,
     }
 

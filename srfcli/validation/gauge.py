@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_banded
 
-SIGMA, QUANTUM, REDDEST = 0.02, 0.005, 0.85
+SIGMA, QUANTUM, MAX_LAG1 = 0.02, 0.005, 0.85
 SPIKE = (0.3, 1.0)  # of the reading: electrical glitches, which nobody takes for readings
 Array = np.ndarray
 

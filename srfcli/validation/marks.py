@@ -20,7 +20,7 @@ from srfcli.core.errors import SrfError
 from srfcli.core.files import read_text, write_atomic
 from srfcli.core.parallel import run_processes
 from srfcli.data.experiment import read_experiment
-from srfcli.diagnosis.search import CLOSE
+from srfcli.diagnosis.search import LOG_BAYES_MARGIN
 from srfcli.laws.registry import load_registry
 from srfcli.results.tables import Column, Table
 from srfcli.validation.apparatus import PAPER, Rig, free_fields
@@ -35,7 +35,7 @@ from srfcli.validation.cases import (
     known_physics,
     known_plans,
     known_rig,
-    unread,
+    noiseless_record,
     without,
 )
 from srfcli.validation.gauge import Gauge, white
@@ -44,14 +44,14 @@ from srfcli.validation.slider import Physics, Plan, critical_load
 # The mark of one answer: which answers are accepted, and whether it is one of them.
 
 # standard errors: an effect whose size is smaller, in units of its error in the best fit, counts as invisible
-INVISIBLE = 5.0
-CONFIDENT = 0.9
-UNNAMED = ("none", "inconclusive", "ambiguous")  # right where what is concealed cannot be seen
+MIN_VISIBLE_SIGMAS = 5.0
+HIGH_CONFIDENCE = 0.9
+VERDICTS_IF_INVISIBLE = ("none", "inconclusive", "ambiguous")  # right where what is concealed cannot be seen
 Accepted = frozenset[tuple[str, frozenset[str]]]
 
 
 @dataclass(frozen=True)
-class Mark:
+class GradedAnswer:
     """An answer and the truth about its case. `right` is the verdict with the very set of effects, or what is as good.
 
     `class_right`: right, or ambiguous with the truth among what is listed or equivalent to it. `alarm`: something is said to be
@@ -102,22 +102,22 @@ class Mark:
 
     @property
     def confident_wrong(self) -> bool:
-        """Return whether the wrong effects are named with a stated confidence above CONFIDENT."""
-        return self.wrong_name and self.answer.confidence.get(self.answer.said, 0.0) > CONFIDENT
+        """Return whether the wrong effects are named with a stated confidence above HIGH_CONFIDENCE."""
+        return self.wrong_name and self.answer.confidence.get(self.answer.said, 0.0) > HIGH_CONFIDENCE
 
 
-def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
+def grade(truth: Mapping[str, Any], answer: Answer, detectability: Detectability) -> GradedAnswer:
     """Return the mark of an answer, given the truth about its case and what there was to be seen."""
     hidden = tuple(truth["effects"])
-    invisible = tuple(n for n in hidden if (s := sight.sigmas.get(n)) is not None and s < INVISIBLE)
+    invisible = tuple(n for n in hidden if (s := detectability.sigmas.get(n)) is not None and s < MIN_VISIBLE_SIGMAS)
     allowed = accepted(truth, invisible)
-    right = answer.verdict != FAILED and as_it_is(answer) in allowed
+    right = answer.verdict != FAILED and as_answered(answer) in allowed
     shares = answer.confidence
     top = max(shares, key=lambda name: shares[name], default="")
-    known = [s for n in hidden if (s := sight.sigmas.get(n)) is not None]
-    return Mark(
+    known = [s for n in hidden if (s := detectability.sigmas.get(n)) is not None]
+    return GradedAnswer(
         answer.case,
-        kind_of(truth),
+        kind_of_case(truth),
         hidden,
         truth["rough"] > 0,
         invisible,
@@ -129,8 +129,8 @@ def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
         top,
         shares.get(top, 0.0),
         holds(top, allowed),
-        _ratio(answer, sight, "augmented"),
-        _ratio(answer, sight, "baseline"),
+        _ratio(answer, detectability, "augmented"),
+        _ratio(answer, detectability, "baseline"),
         deviation(truth, answer),
         allowed,
         truth.get("own_track", False),
@@ -155,7 +155,7 @@ def setting_of(truth: Mapping[str, Any]) -> Mapping[str, str]:
     }
 
 
-def kind_of(truth: Mapping[str, Any]) -> str:
+def kind_of_case(truth: Mapping[str, Any]) -> str:
     """Return the kind of a case, of WIDE_KINDS."""
     if truth.get("kind"):
         return str(truth["kind"])
@@ -176,7 +176,7 @@ def accepted(truth: Mapping[str, Any], invisible: tuple[str, ...]) -> Accepted:
     if invisible and left:
         found.add(("identified", left))
     elif invisible:
-        found |= {(verdict, frozenset()) for verdict in UNNAMED}
+        found |= {(verdict, frozenset()) for verdict in VERDICTS_IF_INVISIBLE}
     return frozenset(found)
 
 
@@ -202,9 +202,9 @@ def _listed(truth: Mapping[str, Any], answer: Answer) -> bool:
     return set(truth["effects"]) <= listed
 
 
-def _ratio(answer: Answer, sight: Sight, model: str) -> float | None:
+def _ratio(answer: Answer, detectability: Detectability, model: str) -> float | None:
     """Return the rms over all held-out runs under `model`, over that under the true one; None where one has none."""
-    pairs = [(run.get(model), sight.known.get(name)) for name, run in answer.held.items()]
+    pairs = [(run.get(model), detectability.known.get(name)) for name, run in answer.held.items()]
     if not pairs or any(a is None or not b for a, b in pairs):
         return None
     ours, true = (sum(float(p[i] or 0.0) ** 2 for p in pairs) for i in (0, 1))
@@ -218,7 +218,7 @@ COEFFICIENTS = ("mu0", "A", "B", "B2", "C", "M")  # what goes with the stiffness
 
 
 @dataclass(frozen=True)
-class Sight:
+class Detectability:
     """What a case's truth says: `known` is each held-out run's rms in um under the true model, the track included.
 
     `sigmas` is how far each concealed effect stands out of the fitted runs, in standard errors of its size in a fit in which the
@@ -234,7 +234,7 @@ class Sight:
 Task = tuple[Path, Mapping[str, Any]]
 
 
-def see(task: Task) -> Sight:
+def detectability_of(task: Task) -> Detectability:
     """Return what there was to be seen in one case: its folder, and the truth about it."""
     folder, truth = task
     gauge, rig = known_gauge(truth), known_rig(truth)
@@ -245,15 +245,17 @@ def see(task: Task) -> Sight:
     for plan, p in sliders.items():
         if plan.name in held:
             run = held[plan.name]
-            made = unread(rig, p, plan) * (rig.factor if rig.observes == "force" else 1.0)
+            made = noiseless_record(rig, p, plan) * (rig.factor if rig.observes == "force" else 1.0)
             known[plan.name] = float(np.sqrt(np.mean((run.observed - made)[run.used] ** 2)))
     fitted = {plan: p for plan, p in sliders.items() if not plan.holdout}
     effects = concealed(truth)
-    stands = {e.name: stands_out(e, [o for o in effects if o is not e], fitted, gauge=gauge, rig=rig) for e in effects}
-    return Sight(folder.name, known, {n: s for n, (s, _) in stands.items()}, {n: r for n, (_, r) in stands.items()})
+    stands = {
+        e.name: effect_standard_errors(e, [o for o in effects if o is not e], fitted, gauge=gauge, rig=rig) for e in effects
+    }
+    return Detectability(folder.name, known, {n: s for n, (s, _) in stands.items()}, {n: r for n, (_, r) in stands.items()})
 
 
-def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, Physics], *, gauge: Gauge,
+def effect_standard_errors(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, Physics], *, gauge: Gauge,
                rig: Rig = PAPER) -> tuple[float | None, float | None]:  # fmt: skip
     """Return how many standard errors an effect stands out of runs, with the baseline free and with it known.
 
@@ -267,14 +269,14 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
     free = free_fields(next(iter(bare.values())))
     free += [o.varies for o in others if o.varies not in free and any(getattr(p, o.varies) for p in bare.values())]
     for plan, p in sliders.items():
-        less, shows = bare[plan], unread(rig, p, plan)
-        base = unread(rig, less, plan)
+        less, shows = bare[plan], noiseless_record(rig, p, plan)
+        base = noiseless_record(rig, less, plan)
         raw = float(np.hypot(raw, np.linalg.norm(white(shows - base, gauge.louder(plan.loud)))))
         if effect.varies == "ratio" and rig.observes == "elongation":
             scaled = [n for n in COEFFICIENTS if n != "M" or any(o.varies == n for o in others)]
             less = replace(less, lam=less.lam * p.ratio, **{n: getattr(less, n) / p.ratio for n in scaled})
-            base = unread(rig, less, plan)
-        moved = [unread(rig, replace(less, **{n: getattr(less, n) * (1 + PARAMETER_STEP)}), plan) for n in free]
+            base = noiseless_record(rig, less, plan)
+        moved = [noiseless_record(rig, replace(less, **{n: getattr(less, n) * (1 + PARAMETER_STEP)}), plan) for n in free]
         signal = shows - base
         tangent = np.column_stack([(x - base) / PARAMETER_STEP for x in moved])
         if not (np.isfinite(signal).all() and np.isfinite(tangent).all()):
@@ -288,25 +290,27 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
     return float(np.linalg.norm(left)), raw
 
 
-def see_all(bank: Path, truths: Mapping[str, Mapping[str, Any]], *, workers: int, kept: Path) -> Iterator[Sight]:
+def detectabilities_of(
+    bank: Path, truths: Mapping[str, Mapping[str, Any]], *, workers: int, kept: Path
+) -> Iterator[Detectability]:
     """Yield what there was to be seen in every case; what the file `kept` holds is not computed again."""
     found = _read(kept)
-    yield from (sight for name, sight in found.items() if name in truths)
+    yield from (detectability for name, detectability in found.items() if name in truths)
     names = [name for name in truths if name not in found]
-    for _, sight in run_processes(see, [(bank / n, truths[n]) for n in names], workers=workers):
-        found[sight.case] = sight
+    for _, detectability in run_processes(detectability_of, [(bank / n, truths[n]) for n in names], workers=workers):
+        found[detectability.case] = detectability
         write_atomic(kept, "".join(json.dumps(asdict(found[n]), sort_keys=True) + "\n" for n in sorted(found)))
-        yield sight
+        yield detectability
 
 
-def _read(kept: Path) -> dict[str, Sight]:
+def _read(kept: Path) -> dict[str, Detectability]:
     if not kept.exists():
         return {}
     try:
-        sights = [Sight(**json.loads(line)) for line in read_text(kept).splitlines()]
+        detectabilities = [Detectability(**json.loads(line)) for line in read_text(kept).splitlines()]
     except (SrfError, ValueError, TypeError, RecursionError) as error:
         raise SrfError(f"{kept}: not what was written: {error}", "Delete the file; it is computed again.") from None
-    return {sight.case: sight for sight in sights}
+    return {detectability.case: detectability for detectability in detectabilities}
 
 
 # The size of an effect as it was estimated, against the size it has in the truth.
@@ -353,7 +357,7 @@ def load_errors(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float]
 # Marks as tables: confusion, rates, power, calibration, held-out errors, sizes and cost.
 
 SCHEMA = "srf.prove/1"
-STANDS_OUT = (0.0, INVISIBLE, 10.0, 20.0, 50.0, 200.0, float("inf"))
+STANDS_OUT = (0.0, MIN_VISIBLE_SIGMAS, 10.0, 20.0, 50.0, 200.0, float("inf"))
 STRENGTHS = (0.0, 1 / 3, 2 / 3, 1.0)
 LONGEST_CPU = 300.0  # s of CPU: a case should take less
 WITHIN = 1.1  # of the true model's error
@@ -365,9 +369,21 @@ SHARE_COLUMNS = (
 COUNTED = (Column("hits", "1", "for how many cases it holds"), Column("cases", "1", "of how many"), *SHARE_COLUMNS)
 
 
-def tables(marks: Sequence[Mark], *, digest: str, seed: int, of: int) -> tuple[Table, list[Table]]:
+def tables(marks: Sequence[GradedAnswer], *, digest: str, seed: int, of: int) -> tuple[Table, list[Table]]:
     """Return the confusion table, whose `meta` holds everything, and the tables that text shows below it."""
-    made = (rates, by_effect, by_outside, by_setting, by_strength, calibrated, held, critical, sizes, cost, ablated)
+    made = (
+        rates,
+        by_effect,
+        by_outside,
+        by_setting,
+        by_strength,
+        calibrated,
+        held_out_errors,
+        critical_load_errors,
+        size_errors,
+        cost,
+        ablated,
+    )
     more = [t for t in (make(marks) for make in made) if t.rows]
     meta: dict[str, Any] = {
         "digest": digest,
@@ -395,7 +411,7 @@ def _cells(found: Rate) -> tuple[Any, ...]:
 FIELDS = ((False, False, "smooth"), (True, False, "one field for all runs"), (True, True, "a field of each run's own"))
 
 
-def confusion(marks: Sequence[Mark]) -> Table:
+def confusion(marks: Sequence[GradedAnswer]) -> Table:
     """Return true kinds against verdicts; `right` counts the effects too, where they are named."""
     columns = (Column("concealed", ""), Column("cases"), *map(Column, VERDICTS), Column("right"), Column("class_right"))
     rows = []
@@ -408,7 +424,7 @@ def confusion(marks: Sequence[Mark]) -> Table:
     return Table(SCHEMA, columns, rows, "What was concealed, and the verdict on it")
 
 
-def rates(marks: Sequence[Mark]) -> Table:
+def rates(marks: Sequence[GradedAnswer]) -> Table:
     """Return the rates on which a diagnosis is judged, with what it should reach."""
     none = [m for m in marks if m.kind == "none"]
     some = [m for m in marks if m.kind != "none"]
@@ -416,7 +432,7 @@ def rates(marks: Sequence[Mark]) -> Table:
     named = [m for m in marks if m.answer.verdict == "identified"]
     rows: list[tuple[Any, ...]] = []
 
-    def add(what: str, chosen: Sequence[Mark], flag: Callable[[Mark], bool], aim: str = "") -> None:
+    def add(what: str, chosen: Sequence[GradedAnswer], flag: Callable[[GradedAnswer], bool], aim: str = "") -> None:
         if chosen:
             rows.append((what, *_cells(rate(flag(m) for m in chosen)), aim or None))
 
@@ -428,7 +444,7 @@ def rates(marks: Sequence[Mark]) -> Table:
     add("false alarm where nothing is concealed", none, lambda m: m.alarm, "< 0.05")
     add("false alarm, without a field", [m for m in none if not m.rough], lambda m: m.alarm)
     add("false alarm, with a field", [m for m in none if m.rough], lambda m: m.alarm, "< 0.05")
-    add(f"wrong name, stated above {CONFIDENT}", marks, lambda m: m.confident_wrong)
+    add(f"wrong name, stated above {HIGH_CONFIDENCE}", marks, lambda m: m.confident_wrong)
     add("wrong name, of all names", named, lambda m: m.wrong_name)
     ageing = [m for m in marks if m.kind == "ageing"]
     alone = [m for m in marks if m.kind == "one-run"]
@@ -440,12 +456,12 @@ def rates(marks: Sequence[Mark]) -> Table:
     add("something concealed is invisible", some, lambda m: not m.visible)
     add("failed", marks, lambda m: m.answer.verdict == "failed")
     columns = (Column("measure", ""), *COUNTED, Column("aim", "", "what it should reach"))
-    note = (f"invisible: fewer than {INVISIBLE:g} standard errors of its size, had one known its form; none, inconclusive and "
-            "ambiguous are right there")  # fmt: skip
+    note = (f"invisible: fewer than {MIN_VISIBLE_SIGMAS:g} standard errors of its size, had one known its form; none, "
+            "inconclusive and ambiguous are right there")  # fmt: skip
     return Table("srf.prove.rates/1", columns, rows, "Rates", (note,))
 
 
-def by_effect(marks: Sequence[Mark]) -> Table:
+def by_effect(marks: Sequence[GradedAnswer]) -> Table:
     """Return, for each effect of the library, how often it was found alone, and named where it was one of two."""
     columns = (
         Column("effect", ""), *COUNTED, Column("class_right"), Column("invisible"), Column("in_pairs"),
@@ -463,7 +479,7 @@ def by_effect(marks: Sequence[Mark]) -> Table:
     return Table("srf.prove.effects/1", columns, rows, "One effect concealed: right")
 
 
-def by_outside(marks: Sequence[Mark]) -> Table:
+def by_outside(marks: Sequence[GradedAnswer]) -> Table:
     """Return, for each effect outside the library, how often it was called unknown, and what it was called else."""
     columns = (Column("outside", ""), *COUNTED, Column("invisible"), Column("called", "", "verdicts other than unknown"))
     rows = []
@@ -475,7 +491,7 @@ def by_outside(marks: Sequence[Mark]) -> Table:
     return Table("srf.prove.outside/1", columns, rows, "Outside the library: unknown")
 
 
-def by_setting(marks: Sequence[Mark]) -> Table:
+def by_setting(marks: Sequence[GradedAnswer]) -> Table:
     """Return how often the answer was right by each circumstance in which something, or nothing, was concealed."""
     columns = (
         Column("circumstance", ""), Column("value", ""), *COUNTED, Column("false_alarms", about="where nothing is concealed"),
@@ -492,7 +508,7 @@ def by_setting(marks: Sequence[Mark]) -> Table:
     return Table("srf.prove.settings/1", columns, rows, "By apparatus, protocol, law, noise and field: right")
 
 
-def by_strength(marks: Sequence[Mark]) -> Table:
+def by_strength(marks: Sequence[GradedAnswer]) -> Table:
     """Return the power: how often something is seen, and named rightly, against how far one effect stands out."""
     columns = (
         Column("measure", ""), Column("from", format=".3g"), Column("to", format=".3g"), Column("cases"),
@@ -502,7 +518,7 @@ def by_strength(marks: Sequence[Mark]) -> Table:
     single = [m for m in marks if m.kind == "single"]
     rows: list[tuple[Any, ...]] = []
 
-    def add(measure: str, edges: Sequence[float], value: Callable[[Mark], float | None]) -> None:
+    def add(measure: str, edges: Sequence[float], value: Callable[[GradedAnswer], float | None]) -> None:
         for low, high in pairwise(edges):
             chosen = [m for m in single if (v := value(m)) is not None and (low <= v < high or v == high == edges[-1])]
             if chosen:
@@ -517,13 +533,13 @@ def by_strength(marks: Sequence[Mark]) -> Table:
     return Table("srf.prove.power/1", columns, rows, "Power: one effect concealed", notes if rows else ())
 
 
-def calibration_of(marks: Sequence[Mark]) -> tuple[tuple[Bin, ...], float | None]:
+def calibration_of(marks: Sequence[GradedAnswer]) -> tuple[tuple[Bin, ...], float | None]:
     """Return how the confidence in the likeliest hypothesis compares with how often it is the truth."""
     spoken = [m for m in marks if m.top]
     return calibration([m.stated for m in spoken], [m.hit for m in spoken])
 
 
-def calibrated(marks: Sequence[Mark]) -> Table:
+def calibrated(marks: Sequence[GradedAnswer]) -> Table:
     """Return the stated confidence of the likeliest hypothesis against how often it was the truth."""
     bins, error = calibration_of(marks)
     columns = (
@@ -535,7 +551,7 @@ def calibrated(marks: Sequence[Mark]) -> Table:
     return Table("srf.prove.calibration/1", columns, rows, "Stated confidence of the likeliest hypothesis", notes)
 
 
-GROUPS: tuple[tuple[str, Callable[[Mark], bool]], ...] = (
+GROUPS: tuple[tuple[str, Callable[[GradedAnswer], bool]], ...] = (
     ("named rightly", lambda m: m.right and m.answer.verdict == "identified"),
     ("named wrongly", lambda m: m.wrong_name),
     ("ambiguous", lambda m: m.answer.verdict == "ambiguous"),
@@ -544,7 +560,7 @@ GROUPS: tuple[tuple[str, Callable[[Mark], bool]], ...] = (
 )
 
 
-def held(marks: Sequence[Mark]) -> Table:
+def held_out_errors(marks: Sequence[GradedAnswer]) -> Table:
     """Return the held-out error over that of the model that knows the truth."""
     columns = (
         Column("answers", ""), Column("cases"), Column("median", format=".3f"), Column("q90", format=".3f"),
@@ -562,7 +578,7 @@ def held(marks: Sequence[Mark]) -> Table:
     return Table("srf.prove.held/1", columns, rows, "Held-out error", (note,) if rows else ())
 
 
-def critical(marks: Sequence[Mark]) -> Table:
+def critical_load_errors(marks: Sequence[GradedAnswer]) -> Table:
     """Return how far the critical loads of the models are off those of the truth, beyond the velocities of the recordings."""
     columns = (
         Column("answers", ""), Column("cases"), Column("median", format=".3g"), Column("q90", format=".3g"),
@@ -581,7 +597,7 @@ def critical(marks: Sequence[Mark]) -> Table:
     return Table("srf.prove.loads/1", columns, rows, "Critical loads off the recordings", (note,) if rows else ())
 
 
-def sizes(marks: Sequence[Mark]) -> Table:
+def size_errors(marks: Sequence[GradedAnswer]) -> Table:
     """Return how well the sizes of rightly named effects, and their standard errors, hold."""
     columns = (
         Column("tracks", ""), Column("within_2", about="no more than 2 standard errors off"), Column("cases"), *SHARE_COLUMNS,
@@ -598,7 +614,7 @@ def sizes(marks: Sequence[Mark]) -> Table:
     return Table("srf.prove.sizes/1", columns, rows, "Sizes of the effects that were named rightly, alone")
 
 
-def cost(marks: Sequence[Mark]) -> Table:
+def cost(marks: Sequence[GradedAnswer]) -> Table:
     """Return what a case takes of CPU."""
     columns = (
         Column("cases"), Column("median", "s", format=".1f"), Column("q90", "s", format=".1f"), Column("max", "s", format=".1f"),
@@ -621,12 +637,12 @@ CASES = (
 )  # fmt: skip
 
 
-def cases(marks: Sequence[Mark]) -> Table:
+def cases(marks: Sequence[GradedAnswer]) -> Table:
     """Return one row per case: what was concealed, what was said, and the mark."""
     return Table("srf.prove.cases/1", CASES, [tuple(row_of(m).values()) for m in marks], "Cases")
 
 
-def row_of(m: Mark) -> Mapping[str, Any]:
+def row_of(m: GradedAnswer) -> Mapping[str, Any]:
     """Return a mark as name -> value, by the columns of CASES."""
     a = m.answer
     values = (
@@ -639,7 +655,7 @@ def row_of(m: Mark) -> Mapping[str, Any]:
 
 # Counts as rates with intervals, and stated confidence against how often it was right.
 
-Z = 1.959963984540054  # of a two-sided interval of 95 %
+WILSON_Z = 1.959963984540054  # of a two-sided interval of 95 %
 EDGES = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)
 
 
@@ -661,8 +677,8 @@ class Rate:
         if not self.count:
             return None, None
         n, p = self.count, self.hits / self.count
-        middle = (p + Z**2 / (2 * n)) / (1 + Z**2 / n)
-        half = Z / (1 + Z**2 / n) * (p * (1 - p) / n + Z**2 / (4 * n**2)) ** 0.5
+        middle = (p + WILSON_Z**2 / (2 * n)) / (1 + WILSON_Z**2 / n)
+        half = WILSON_Z / (1 + WILSON_Z**2 / n) * (p * (1 - p) / n + WILSON_Z**2 / (4 * n**2)) ** 0.5
         # the exact ends: rounding must not put 0 of n above 0
         return (0.0 if self.hits == 0 else middle - half), (1.0 if self.hits == n else middle + half)
 
@@ -704,10 +720,10 @@ def quantile(values: Sequence[float], share: float) -> float | None:
 
 # Ablations: the same searches, judged without some of the tests.
 
-Judge = Callable[[Answer], tuple[str, frozenset[str]]]
+VerdictRule = Callable[[Answer], tuple[str, frozenset[str]]]
 
 
-def as_it_is(answer: Answer) -> tuple[str, frozenset[str]]:
+def as_answered(answer: Answer) -> tuple[str, frozenset[str]]:
     """Return the verdict, and the effects that it names."""
     return answer.verdict, frozenset(answer.effects) if answer.verdict == "identified" else frozenset()
 
@@ -715,14 +731,14 @@ def as_it_is(answer: Answer) -> tuple[str, frozenset[str]]:
 def ungated(answer: Answer) -> tuple[str, frozenset[str]]:
     """Return what would have been said had held-out runs no say."""
     if answer.ungated in ("", answer.verdict):
-        return as_it_is(answer)
+        return as_answered(answer)
     return answer.ungated, hypothesis(_named(answer))[1] if answer.ungated == "identified" else frozenset()
 
 
 def information_criterion(answer: Answer) -> tuple[str, frozenset[str]]:
     """Return what the smallest Bayesian information criterion says: always a model, whatever it leaves over."""
     if not answer.tried:
-        return as_it_is(answer)
+        return as_answered(answer)
 
     def criterion(name: str) -> float:
         t = answer.tried[name]
@@ -735,19 +751,19 @@ def _named(answer: Answer) -> str:
     """Return the hypothesis that is named where no run is held out: the best that leaves noise alone and holds no smaller one."""
     evidence = {name: t["evidence"] for name, t in answer.tried.items()}
     top = max(evidence.values())
-    close = [n for n in sorted(evidence) if answer.tried[n]["fine"] and top - evidence[n] < CLOSE]
+    close = [n for n in sorted(evidence) if answer.tried[n]["fine"] and top - evidence[n] < LOG_BAYES_MARGIN]
     smallest = [n for n in close if not any(hypothesis(other)[1] < hypothesis(n)[1] for other in close)]
     return max(smallest or sorted(evidence), key=evidence.__getitem__)
 
 
-JUDGES: tuple[tuple[str, Judge], ...] = (
-    ("as it is", as_it_is),
+VERDICT_RULES: tuple[tuple[str, VerdictRule], ...] = (
+    ("as it is", as_answered),
     ("no held-out gate", ungated),
     ("information criterion alone", information_criterion),
 )
 
 
-def ablated(marks: Sequence[Mark]) -> Table:
+def ablated(marks: Sequence[GradedAnswer]) -> Table:
     """Return the main rates of the verdicts, and of what would have been said without a gate."""
     columns = (
         Column("judged", ""), Column("cases"), Column("right", format=".3f"),
@@ -757,7 +773,7 @@ def ablated(marks: Sequence[Mark]) -> Table:
     )  # fmt: skip
     chosen = [m for m in marks if m.answer.tried]
     rows = []
-    for title, judge in JUDGES if chosen else ():
+    for title, judge in VERDICT_RULES if chosen else ():
         said = [judge(m.answer) for m in chosen]
         right = [s in m.accepted for m, s in zip(chosen, said, strict=True)]
         none = [s for m, s in zip(chosen, said, strict=True) if m.kind == "none"]

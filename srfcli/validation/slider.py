@@ -282,7 +282,7 @@ class Plan:
 FASTEST_SLIP = 60.0  # of ln(v/V0): what a solver's trial step may ask for is kept finite
 
 
-class Felt(NamedTuple):  # a run makes a hundred thousand of them
+class ContactLoad(NamedTuple):  # a run makes a hundred thousand of them
     """The load at the asperities and its rate, N and N/s, beside the imposed one, its W - W0 and its rate."""
 
     W: float
@@ -292,23 +292,23 @@ class Felt(NamedTuple):  # a run makes a hundred thousand of them
     imposed_rate: float
 
 
-def felt_load(p: Physics, plan: Plan) -> Callable[[float], Felt]:
+def contact_load(p: Physics, plan: Plan) -> Callable[[float], ContactLoad]:
     """Return the load that reaches the asperities, before any delay, as a function of time."""
     imposed, switched, W0 = plan.load(), plan.switched(), plan.W0
     height, omega = p.distortion * plan.eps * W0, 4 * math.pi * plan.f
 
-    def felt(t: float) -> Felt:
+    def contact_load_at(t: float) -> ContactLoad:
         W, rate = imposed(t)
         if not plan.eps:
             # a slow step of the load is no modulation: it arrives in full
-            return Felt(W - p.pore, rate, W - W0, W, rate)
+            return ContactLoad(W - p.pore, rate, W - W0, W, rate)
         s, s_dot = switched(t)
         angle = omega * t + p.distortion_phase
         here = W0 + p.rho * (W - W0) + height * s * math.cos(angle)
         slope = p.rho * rate + height * (s_dot * math.cos(angle) - s * omega * math.sin(angle))
-        return Felt(here - p.pore, slope, W - W0, W, rate)
+        return ContactLoad(here - p.pore, slope, W - W0, W, rate)
 
-    return felt
+    return contact_load_at
 
 
 def at_unit_velocity(p: Physics, longest: float) -> Callable[[float, float, float, float, float], tuple[float, float]]:
@@ -467,10 +467,10 @@ def stiffness(p: Physics) -> Callable[[float], float]:
 
 Sliding = tuple[float, float, float]  # slip velocity um/s, elongation of the spring um, friction force N
 # of states, m, a, load, force along, spring's K
-Slide = Callable[[list[float], float, float, float, float, float], Sliding]
+SlidingFunction = Callable[[list[float], float, float, float, float, float], Sliding]
 # of states, the above, stage velocity, force, K
-Push = Callable[[list[float], Sliding, float, float, float], list[float]]
-Pull = Callable[[list[float], list[float], float, float], float]  # of states, their rates, load and its rate: F'
+MechanicalRates = Callable[[list[float], Sliding, float, float, float], list[float]]
+ForceRate = Callable[[list[float], list[float], float, float], float]  # of states, their rates, load and its rate: F'
 
 
 @dataclass(frozen=True)
@@ -478,23 +478,23 @@ class Contact:
     """A slider's mechanical states, what they say about its sliding, their rates, and their values in steady sliding."""
 
     names: tuple[str, ...]
-    slide: Slide
-    push: Push
+    sliding_at: SlidingFunction
+    mechanical_rates: MechanicalRates
     steady: Callable[[float, float, float, float], list[float]]  # of velocity, friction force, load, spring's K
-    pull: Pull | None = None  # the rate of the friction force, where it follows from the states
+    force_rate: ForceRate | None = None  # the rate of the friction force, where it follows from the states
 
 
 def _elastic(p: Physics) -> Contact:
     """The stretch e of the interface is a state: kappa e + eta (z - v) = F = (W + Wa) mu(v, phi) gives v."""
     kappa, (_, velocity) = stiffness(p), friction(p)
 
-    def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
+    def sliding_at(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
         weight = W + p.Wa
         pull = kappa(W) * y[2] + p.eta * y[1]
         v = p.V0 * math.exp(velocity(pull / weight, m, a, p.drag + p.eta * p.V0 / weight))
         return v, y[0], pull - p.eta * v
 
-    def push(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
+    def mechanical_rates(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
         v, u, F = sliding
         return [V - y[1], (K * u + aside - F) / p.M, y[1] - v]
 
@@ -502,35 +502,35 @@ def _elastic(p: Physics) -> Contact:
         return (W * rates[2] + W_dot * y[2]) / p.lam
 
     known = None if p.eta or p.n_kappa != 1.0 else rate
-    return Contact(("u", "z", "e"), slide, push, lambda V, F, W, K: [F / K, V, F / kappa(W)], known)
+    return Contact(("u", "z", "e"), sliding_at, mechanical_rates, lambda V, F, W, K: [F / K, V, F / kappa(W)], known)
 
 
 def _rigid(p: Physics) -> Contact:
     """There is nothing to stretch: ln v is a state, which inertia moves."""
     resistance, _ = friction(p)
 
-    def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
+    def sliding_at(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
         x = min(y[1], FASTEST_SLIP)
         v = p.V0 * math.exp(x)
         return v, y[0], (W + p.Wa) * resistance(x, m, a, p.drag)
 
-    def push(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
+    def mechanical_rates(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
         v, u, F = sliding
         return [V - v, (K * u + aside - F) / (p.M * v)]
 
-    return Contact(("u", "ln_v"), slide, push, lambda V, F, W, K: [F / K, math.log(V / p.V0)])
+    return Contact(("u", "ln_v"), sliding_at, mechanical_rates, lambda V, F, W, K: [F / K, math.log(V / p.V0)])
 
 
 def _massless(p: Physics) -> Contact:
     """Spring and interface in series carry the friction force; their joint stretch D is the state."""
     kappa, (_, velocity) = stiffness(p), friction(p)
 
-    def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
+    def sliding_at(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
         yielding = 1 / K + (0.0 if p.rigid else 1 / kappa(W))
         F = (y[0] + aside / K) / yielding
         return p.V0 * math.exp(velocity(F / (W + p.Wa), m, a, p.drag)), (F - aside) / K, F
 
-    def push(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
+    def mechanical_rates(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
         return [V - sliding[0]]
 
     def rate(y: list[float], rates: list[float], W: float, W_dot: float) -> float:
@@ -541,7 +541,7 @@ def _massless(p: Physics) -> Contact:
         return (rates[0] + y[0] / yielding * p.lam * W_dot / W**2) / yielding
 
     known = None if p.cross or p.K_power or p.n_kappa != 1.0 else rate
-    return Contact(("D",), slide, push, lambda V, F, W, K: [F / K + (0.0 if p.rigid else F / kappa(W))], known)
+    return Contact(("D",), sliding_at, mechanical_rates, lambda V, F, W, K: [F / K + (0.0 if p.rigid else F / kappa(W))], known)
 
 
 # The run of a slider from steady sliding: states joined, integrated by backward differentiation formulas, read by a gauge.
@@ -561,9 +561,9 @@ class Slider:
     def __init__(self, p: Physics, plan: Plan) -> None:
         self.p, self.plan = p, plan
         self.contact = _massless(p) if p.massless else _rigid(p) if p.rigid else _elastic(p)
-        if p.nagata and (self.contact.pull is None or p.Wa):
+        if p.nagata and (self.contact.force_rate is None or p.Wa):
             raise ValueError("nagata: the rate of the friction force does not follow from the states")
-        self._felt = felt_load(p, plan)
+        self._felt = contact_load(p, plan)
         self._terms = at_unit_velocity(replace(p, track=p.track.under(plan.name)), plan.distance + OVERSHOOT)
         self._aged, self._aged2, (self._resistance, _) = ageing(p), second_ageing(p), friction(p)
         extra = {
@@ -575,7 +575,7 @@ class Slider:
         where = [self.names.index(name) if name in self.names else 0 for name in extra]  # 0 is always mechanical
         self._age2, self._delay, self._gauge, self._stage, self._X, self._servo, _, self._late, self._heat, self._pore = where
 
-    def sliding(self, t: float, y: list[float]) -> tuple[Sliding, Felt]:
+    def sliding(self, t: float, y: list[float]) -> tuple[Sliding, ContactLoad]:
         """Return slip velocity, elongation and friction force, and the load at the asperities, at time t in s."""
         felt, p = self._felt(t), self.p
         if self._delay:
@@ -593,7 +593,7 @@ class Slider:
             share = 1 - y[self._pore] * self.plan.W0 / felt.W
             m, a = share * m, share * a
         K = p.spring_under(felt.imposed)
-        return self.contact.slide(y, m, a, felt.W, -p.cross * felt.excess, K), felt
+        return self.contact.sliding_at(y, m, a, felt.W, -p.cross * felt.excess, K), felt
 
     def rates(self, t: float, states: Array, V: float) -> list[float]:
         """Return the rates of the states at time t in s, where the stage's nominal velocity is V um/s.
@@ -616,8 +616,8 @@ class Slider:
         if self._X:
             V *= 1 + p.ripple * math.cos(2 * math.pi * y[self._X] / p.ripple_p + p.ripple_phase)
         V += p.poisson * felt.imposed_rate
-        out = self.contact.push(y, sliding, V, -p.cross * felt.excess, p.spring_under(felt.imposed))
-        F_dot = self.contact.pull(y, out, felt.W, felt.rate) if p.nagata and self.contact.pull else 0.0
+        out = self.contact.mechanical_rates(y, sliding, V, -p.cross * felt.excess, p.spring_under(felt.imposed))
+        F_dot = self.contact.force_rate(y, out, felt.W, felt.rate) if p.nagata and self.contact.force_rate else 0.0
         out += (self._aged(v, y[self._age], felt.W, felt.rate, F_dot), v)
         if self._age2:
             out.append(self._aged2(v, y[self._age2], felt.W, felt.rate, F_dot))
@@ -727,7 +727,7 @@ UNSTEADY: dict[str, Any] = {
     "track": Track(), "topo": 0.0, "bump": 0.0, "drift_t": 0.0, "drift_x": 0.0, "ripple": 0.0, "drive_tau": 0.0, "harden": 0.0,
 }  # fmt: skip
 UNFELT_DELAYS: dict[str, Any] = {"lag": 0.0, "creep": 0.0, "servo": 0.0}  # of gauge and servo: steady sliding does not feel them
-SIZES_OF_LOAD = 60  # that are tried, evenly in their logarithm
+LOAD_TRIALS = 60  # that are tried, evenly in their logarithm
 STATE_DIFFERENCE = 1e-4  # relative, of a state: a critical load is 2e-5 off; the friction law is inverted to some 1e-10
 
 
@@ -749,7 +749,7 @@ def critical_load(p: Physics, V: float, low: float, high: float) -> float:
             J[:, column] = (above - below) / (2 * step[i])
         return float(np.linalg.eigvals(J).real.max()) if np.isfinite(J).all() else math.nan
 
-    grid = np.linspace(math.log(low), math.log(high), SIZES_OF_LOAD)
+    grid = np.linspace(math.log(low), math.log(high), LOAD_TRIALS)
     found = np.array([growth(x) for x in grid])
     lost = np.flatnonzero((found[:-1] < 0) & (found[1:] >= 0))
     return math.exp(brentq(growth, grid[lost[0]], grid[lost[0] + 1], xtol=1e-9)) if lost.size else math.nan

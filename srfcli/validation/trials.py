@@ -204,14 +204,14 @@ class ProofResult(Result):
         Cases, seed, kinds, track and bank.
     digest : str
         SHA-256 of the truths, as it was published with the cases.
-    marks : tuple of Mark
+    marks : tuple of GradedAnswer
         Each answer with what was concealed, and whether it is right.
     """
 
     trial: Trial
     asked: Mapping[str, Any]
     digest: str
-    marks: tuple[marking.Mark, ...] = field(repr=False)
+    marks: tuple[marking.GradedAnswer, ...] = field(repr=False)
 
     @cached_property
     def _tables(self) -> tuple[Table, list[Table]]:
@@ -357,10 +357,10 @@ def prove(
         for answer in answer_all(trial, workers=workers, plugins=places, limit=60 * limit):
             progress("diagnosed", f"{answer.case} in {answer.cpu:.0f} s of CPU", len(waiting))
     truths, answers = open_truths(trial, unfinished=unfinished)
-    sights = {}
+    detectabilities = {}
     progress("truth", "", len(truths))
-    for sight in marking.see_all(trial.bank, truths, workers=workers, kept=trial.folder / "known.jsonl"):
-        sights[sight.case] = sight
-        progress("truth", sight.case, len(truths))
-    marks = tuple(marking.mark(truths[name], answers[name], sights[name]) for name in truths)
+    for detectability in marking.detectabilities_of(trial.bank, truths, workers=workers, kept=trial.folder / "known.jsonl"):
+        detectabilities[detectability.case] = detectability
+        progress("truth", detectability.case, len(truths))
+    marks = tuple(marking.grade(truths[name], answers[name], detectabilities[name]) for name in truths)
     return ProofResult(trial, trial.asked(), trial.digest(), marks)

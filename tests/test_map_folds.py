@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 from srfcli.numerics.continuation import ContinuationSettings
-from srfcli.numerics.map import STABILITY_KINDS, compute_map, settle
+from srfcli.numerics.map import STABILITY_KINDS, compute_map, integrate_to_periodic_state
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.orbit import robust_orbits, solve_orbits, uniform_mesh
 from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings
@@ -127,7 +127,7 @@ def test_a_simulation_leads_to_the_state_beyond_the_fold(model):
     below[model.index("eps")] = 0.0028
     stable = robust_orbits(model, below[:, None], None, edges)
     assert stable.converged[0] and not before.converged[0]
-    guess = settle(model, p, stable.orbit.x[0, 0], edges)
+    guess = integrate_to_periodic_state(model, p, stable.orbit.x[0, 0], edges)
     beyond = solve_orbits(model, p[:, None], guess)
     assert beyond.converged[0] and np.abs(beyond.multipliers[0]).max() < 1
     v = np.exp(beyond.orbit.x[0][:, model.states.index("ln_v")])
