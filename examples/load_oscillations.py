@@ -14,7 +14,9 @@ best, and the parameters.
     nagata               phi' = ... - (c/B) phi tau'/W                      J. Geophys. Res. 117, B02314 (2012)
     load-transmission    the gouge feels W0 + rho (W - W0)
 
---stand-in writes a recording of the same form, by equations and a solver of their own (srfcli.validation.slider).
+--stand-in writes a recording of the same form, by equations and a solver of their own (srfcli.validation.slider), on a spring of
+--stiffness. At the default one, alpha of 0.4 or more under amplitudes of 2 MPa and periods of 5 s or longer makes slip without
+end: take 1.2e-2 MPa/um there, at which all alpha of 0.1 to 0.5, amplitudes of 0.5 to 2 MPa and periods of 0.5 to 50 s can be had.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from numpy.typing import NDArray
 from scipy import optimize, signal
 
 from srfcli.core.errors import SrfError
-from srfcli.core.units import split_quantity
+from srfcli.core.units import convert, same_dimension, split_quantity
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.goodness_of_fit import failed_tests
@@ -292,11 +294,23 @@ def stand_in(
                 onset=onset)  # fmt: skip
     trace = move(physics, plan)
     if not trace.complete:
-        raise SrfError("the slider cannot be followed to the end", "Choose a smaller amplitude, or a stiffer spring.")
+        at, stiffer = float(trace.t[np.isfinite(trace.u)][-1]), 2 * physics.K
+        raise SrfError(
+            f"after {(at - onset) / period:.2f} periods the slider, which has no mass, slips at more than 1 m/s",
+            f'Choose a stiffer spring, such as --stiffness "{stiffer:g} MPa/um", or a smaller amplitude or alpha.',
+        )
     load = plan.load()
     rng = np.random.default_rng(seed)
     shear = physics.K * trace.u + NOISE * rng.standard_normal(trace.t.size)
     return replace(trace, u=shear), np.array([load(t)[0] for t in trace.t.tolist()])
+
+
+def spring(text: str, *, normal: float) -> float:
+    """Return a stiffness in MPa/um; one of friction over a length is multiplied by the normal stress (MPa)."""
+    number, unit = split_quantity(text, name="--stiffness")
+    if unit and same_dimension(unit, "1/um"):
+        return convert(number, unit, "1/um", name="--stiffness") * normal
+    return convert(number, unit, "N/um", name="--stiffness") if unit else number  # a stress is the force on 1 mm^2
 
 
 def write_stand_in(path: Path, trace: Trace, normal: Array, velocity: float = 10.0) -> None:
@@ -349,7 +363,8 @@ def main(given: Sequence[str] | None = None) -> int:
     try:
         split_quantity(options.stiffness, name="--stiffness")
         if options.stand_in:
-            physics = replace(QUARTZ, alpha=options.alpha, nagata=options.c, rho=options.rho)
+            K = spring(options.stiffness, normal=options.mean)
+            physics = replace(QUARTZ, K=K, alpha=options.alpha, nagata=options.c, rho=options.rho)
             trace, normal = stand_in(physics, normal=options.mean, amplitude=options.amplitude, period=options.period)
             path = options.stand_in / "oscillation.csv"
             write_stand_in(path, trace, normal)

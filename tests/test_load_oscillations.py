@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from srfcli.codegen.c_source import compiler
+from srfcli.core.errors import SrfError
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
 
@@ -105,3 +107,14 @@ def test_columns_of_any_name_and_unit_are_those_that_options_name(example, tmp_p
     assert two.t == pytest.approx(one.t) and two.observed == pytest.approx(one.observed, abs=2e-5)
     assert two.drive(two.t[5:-5]) == pytest.approx(10.0, rel=1e-3)
     assert example.check(example.experiment_of(example.arguments([str(other), *names]), example.MODELS[0]))
+
+
+def test_a_stand_in_that_runs_away_names_a_spring_on_which_it_does_not(example):
+    """Without a mass a slip that the spring does not end becomes faster than any apparatus."""
+    fast = {"alpha": 0.5, "nagata": 0.0, "rho": 1.0}
+    with pytest.raises(SrfError, match="no mass, slips at more than 1 m/s") as caught:
+        example.stand_in(replace(example.QUARTZ, **fast), amplitude=2.0, period=20.0, periods=2)
+    told = re.search(r'--stiffness "([^"]*)"', caught.value.hint)
+    K = example.spring(told[1], normal=12.0)
+    trace, _ = example.stand_in(replace(example.QUARTZ, K=K, **fast), amplitude=2.0, period=20.0, periods=2)
+    assert trace.complete and K == 0.012 == pytest.approx(example.spring("1e-3 1/um", normal=12.0))
