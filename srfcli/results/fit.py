@@ -536,7 +536,7 @@ def flag(fit: Fit, k: int) -> str:
     other = int(np.argmax(tied)) if tied.size > 1 else k
     if tied[other] > TIED:
         return f"tied to {fit.names[other]}: correlation {fit.correlation[k][other]:.3f}"
-    bound = [other for i, other in enumerate(fit.names) if _at_bound(fit, i)]
+    bound = [other for i, other in enumerate(fit.names) if _at_bound(fit, i) and not math.isinf(fit.stderr[other])]
     return f"error with {joined(bound)} held at {'a bound' if len(bound) == 1 else 'bounds'}" if bound else ""
 
 
