@@ -78,7 +78,7 @@ class WithoutProjection(ModelSearch):
 STEPS = {  # a step: the method that is left out
     "another-ageing-law-near-by": "_try_ageing_laws",
     "from-the-file": "_refit_from_start_values",
-    "likeliest-from-the-file": "_fit_likeliest_afresh",
+    "likeliest-from-the-file": "_refit_likeliest",
     "pairs-from-the-file": "_with_a_second",
     "scores-without-field": "_expand_without_field",
     "noise-of-each-run": "_with_own_noise",

@@ -203,8 +203,8 @@ class ModelSearch:
         self.count = 0
         self._expected: dict[str, float] = {}  # the most that was expected of each effect beside the baseline
         self._taken: set[tuple[Callable[[Fitted], Any], str]] = set()  # steps, and of which model
-        self._afresh: dict[str, _Trial] = {}  # models that were begun from the start values of the file
-        self._followed: set[str] = set()  # models that were fitted from the start values of the file
+        self._trials: dict[str, _Trial] = {}  # models that were begun from the start values of the file
+        self._finished: set[str] = set()  # models that were fitted from the start values of the file
         self._tried: dict[str, tuple[bool, Array]] = {}  # each other ageing law: whether to its maximum, and from where, last
 
     def progress(self, text: str) -> None:
@@ -370,7 +370,7 @@ class ModelSearch:
             # field or noise make up for what is missing: without them it shows, or it is another law
             if noise_is_implausible(base.fit):
                 self._take_step(self._expand_without_field, base)
-                self._take_step(self._fit_likeliest_afresh, base)
+                self._take_step(self._refit_likeliest, base)
                 # what is likelier where it begins, else what is expected
                 if not self._explained and self._queue_is_promising(base):
                     move = max(self.queue, key=lambda m: (max(self._initial_evidence(m, base), base.evidence), -m.expected))
@@ -787,31 +787,31 @@ class ModelSearch:
             known = self.fitted.get(single.name)
             models += [] if known and known.passes else [single]
         highest = self._without_colour(best) if best.name != base.name else -np.inf
-        others, highest = self._follow([m for m in models if m.name not in self._followed], highest)
+        others, highest = self._finish_plausible([m for m in models if m.name not in self._finished], highest)
         if not self._explained:
             for trial in sorted(others, key=lambda t: -t.found.point.log_likelihood)[:MIN_RESTARTS]:
                 highest = self._finish_from_start_values(trial, highest)
                 if self._explained:
                     return
 
-    def _fit_likeliest_afresh(self, base: Fitted) -> None:
+    def _refit_likeliest(self, base: Fitted) -> None:
         """Fit the effects of which most is expected, and what they lack then, from the file's own start values."""
         likeliest = {m.hypothesis.name: m.hypothesis for m in sorted(self.queue) if -m.expected > base.evidence}
-        self._follow([m for m in list(likeliest.values())[:MIN_RESTARTS] if not any(e.run for e in m.effects)], -np.inf)
+        self._finish_plausible([m for m in list(likeliest.values())[:MIN_RESTARTS] if not any(e.run for e in m.effects)], -np.inf)
 
     @property
     def _explained(self) -> bool:
         """Return whether a model with an effect, or another law, is the best and passes."""
         return self.best().passes and bool(self.best().hypothesis.reported)
 
-    def _follow(self, models: Sequence[Hypothesis], highest: float) -> tuple[list[_Trial], float]:
+    def _finish_plausible(self, models: Sequence[Hypothesis], highest: float) -> tuple[list[_Trial], float]:
         """Begin models from the start values of the file, and fit those that keep a field no wider than one may be.
 
         Until one passes. Return the others, and the highest log likelihood that was reached under white noise.
         """
         others = []
         for hypothesis in models:
-            trial = self._begun_afresh(hypothesis)
+            trial = self._trial(hypothesis)
             if trial is not None and noise_is_implausible(StateSpaceFit(trial.own, trial.found)):
                 others.append(trial)
             elif trial is not None:
@@ -820,10 +820,10 @@ class ModelSearch:
                     break
         return others, highest
 
-    def _begun_afresh(self, hypothesis: Hypothesis) -> _Trial | None:
+    def _trial(self, hypothesis: Hypothesis) -> _Trial | None:
         """Return where a few steps lead from the start values of the file, under a wide field and white gauge noise."""
-        if hypothesis.name in self._afresh:
-            return self._afresh[hypothesis.name]
+        if hypothesis.name in self._trials:
+            return self._trials[hypothesis.name]
         name = hypothesis.effects[-1].reported if hypothesis.effects else hypothesis.ageing
         beside = self._likelihood(hypothesis, self.baseline, name)
         if beside is None:
@@ -833,7 +833,7 @@ class ModelSearch:
         if start is None:
             return None
         found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
-        trial = self._afresh[hypothesis.name] = _Trial(hypothesis, beside, own, found)
+        trial = self._trials[hypothesis.name] = _Trial(hypothesis, beside, own, found)
         return trial
 
     def _with_a_second(self, trial: _Trial) -> _Trial | None:
@@ -851,7 +851,7 @@ class ModelSearch:
         self.progress(f"{hypothesis.name}: scores under white noise")
         gains = self._gains(self._scores(self._waypoint(hypothesis, fit)))
         likeliest = [score.effect for gain, score in sorted(gains, key=lambda p: -p[0])[:MIN_RESTARTS] if gain > MIN_SCORE_GAIN]
-        pairs = [self._begun_afresh(Hypothesis((*hypothesis.effects, effect), hypothesis.ageing)) for effect in likeliest]
+        pairs = [self._trial(Hypothesis((*hypothesis.effects, effect), hypothesis.ageing)) for effect in likeliest]
         likelier = [p for p in pairs if p and p.found.expected > fit.log_likelihood + MIN_SCORE_GAIN]
         return max(likelier, key=lambda p: p.found.point.log_likelihood, default=None)
 
@@ -862,7 +862,7 @@ class ModelSearch:
         That is returned.
         """
         hypothesis, beside, own, found = trial.hypothesis, trial.beside, trial.own, trial.found
-        self._followed.add(hypothesis.name)
+        self._finished.add(hypothesis.name)
         places = [near] if hypothesis.ageing and (near := self._maximum_near_parents(hypothesis, beside)) else []
         if found.away > 1.0 and found.point.log_likelihood > highest - PRUNING_DEFICIT:
             found = maximise(own, found.point.x, close=1.0, progress=self.progress)
