@@ -56,7 +56,7 @@ class SrfError(Exception):
     """Misuse that stops a command: `message` says what and where, `hint` what to do instead.
 
     `exit_code` is 2 for usage, laws and recordings; 1 for I/O. `kind` names an error that some caller treats by itself:
-    "no file", "unknown name", "no contact", "unit" where the hint says what unit would do.
+    "no file", "unknown name", "unit" where the hint says what unit would do.
     """
 
     def __init__(self, message: str, hint: str | None = None, *, exit_code: int = 2, kind: str = "") -> None:
@@ -66,6 +66,12 @@ class SrfError(Exception):
         self.hint = hint
         self.exit_code = exit_code
         self.kind = kind
+
+
+class NoContact(SrfError):
+    """A load that would lift the slider; `window` is the longest time (s) in contact, None where there is none."""
+
+    window: tuple[float, float] | None = None
 
 
 class ExpressionError(SrfError):

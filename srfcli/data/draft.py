@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.errors import NoContact, SrfError, did_you_mean
 from srfcli.core.files import toml_value, unused_name
 from srfcli.core.settings import Parameter
 from srfcli.core.units import (
@@ -299,12 +299,11 @@ def missing(
     """
     roles = {named.role for named in columns}
     listed = ", ".join(f"'{h}'" for h in headings)
-    lacks = []
+    kinds, lacks = {_kind_of_unit(_spelled(h)[1]) for h in headings}, []
     if "time" not in roles:
         lacks.append(("`columns` time=HEADING", f"{path}: which column is the time? It has {listed}"))
     if not roles & set(OBSERVED_ROLES):
         what = "friction, shear stress, force or elongation of the spring"
-        kinds = {_kind_of_unit(_spelled(h)[1]) for h in headings}
         role = "force" if "N" in kinds and "MPa" not in kinds else "shear_stress"
         lacks.append((f"`columns` {role}=HEADING", f"{path}: which column is {what}? It has {listed}"))
     if not (driven or roles.intersection(DRIVES)):
@@ -312,12 +311,8 @@ def missing(
         option = f"{pieces}, or `columns` load_point_displacement=HEADING"
         lacks.append((option, f"{path}: which column is the load point's velocity or displacement? It has {listed}"))
     if not (loaded or roles & {"normal_load", "normal_stress", "friction"}):
-        weighed = "N" in {_kind_of_unit(_spelled(h)[1]) for h in headings}
-        load, role = (
-            ("5 N", "normal_load")
-            if roles & {"force"} or (weighed and not roles & {"shear_stress"})
-            else ("20 MPa", "normal_stress")
-        )
+        in_newton = "force" in roles or ("N" in kinds and "shear_stress" not in roles)
+        load, role = ("5 N", "normal_load") if in_newton else ("20 MPa", "normal_stress")
         option = f"`load` '{load}', or `columns` {role}=HEADING"
         lacks.append((option, f"{path}: which column is the normal load or stress? It has {listed}"))
     return lacks
@@ -592,11 +587,9 @@ def _read(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, Experiment]:
                 return sketch, read_experiment(file, registry=registry)
             except StartsAtRest as error:
                 sketch = replace(sketch, free=(*sketch.free, error.run))
-            except SrfError as error:
-                if error.kind == "no contact":
-                    found = re.search(r"such as \[(\S+), (\S+)\] s", error.hint or "")
-                    part = f"{found[1]},{found[2]}, say, in s" if found else "FROM,TO in seconds"
-                    error.hint = f"Take the part in contact: `window` {part}."
+            except NoContact as error:
+                part = "{:.7g},{:.7g}, say, in s".format(*error.window) if error.window else "FROM,TO in seconds"
+                error.hint = f"Take the part in contact: `window` {part}."
                 raise
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import Notice, SrfError
+from srfcli.core.errors import NoContact, Notice, SrfError
 from srfcli.core.units import is_stress
 from srfcli.data.clock import Place, kept_samples
 from srfcli.data.columns import DRIVES, MOST_BYTES, Columns, Finder, open_source
@@ -805,23 +805,25 @@ def load_from_column(place: Place, W: Array, unit: str = "N") -> tuple[Load, lis
     good = known & ~bad
     filled = np.interp(t, t[good], filled[good])
     if filled.min() < NO_CONTACT:
-        at, part = int(filled.argmin()), _pressed(t, filled)
-        raise SrfError(
+        at, window = int(filled.argmin()), _pressed(t, filled)
+        part = f", such as [{window[0]:.7g}, {window[1]:.7g}] s" if window else ""
+        error = NoContact(
             f"{place.span(at, at)}, column '{place.heading}': the load is {filled[at]:.6g} {unit}",
             f"The slider must stay in contact: zero the gauge ([columns] offset), or take a window without this part{part}.",
-            kind="no contact",
         )
+        error.window = window
+        raise error
     load, told = _smooth(place, filled, unit)
     return load, [*notices, *told]
 
 
-def _pressed(t: Array, W: Array) -> str:
-    """Return ", such as [FROM, TO]" of the longest time in which the loads W (n,) are those of a contact, if there is any."""
+def _pressed(t: Array, W: Array) -> tuple[float, float] | None:
+    """Return the longest time (s) in which the loads W (n,) are those of a contact, None where there is none."""
     low = PRESSED * float(np.median(W))  # less is loading and unloading
     ends = np.flatnonzero(np.diff((max(low, NO_CONTACT) < W).astype(int), prepend=0, append=0)).reshape(-1, 2)
     spans = [(float(t[b - 1] - t[a]), a, b - 1) for a, b in ends.tolist()]
     length, first, last = max(spans, default=(0.0, 0, 0))
-    return f", such as [{t[first]:.7g}, {t[last]:.7g}] s" if length > 0 else ""
+    return (float(t[first]), float(t[last])) if length > 0 else None
 
 
 def _smooth(place: Place, W: Array, unit: str) -> tuple[Load, list[Notice]]:

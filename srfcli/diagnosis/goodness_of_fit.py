@@ -85,8 +85,7 @@ def own_levels(found: StateSpaceFit) -> list[str]:
     problem, states = found.likelihood.problem, found.likelihood.problem.model.states
     if found.smooth or len(problem.runs) < 2 or "mu0" not in problem.names or "mu0" in problem.experiment.vary:
         return []
-    point = found.likelihood.at(found.maximum.point.x, slopes=False, keep=True)
-    fields = {f.run.name: f.smoothed().mean[:, states.index("field")] for f in point.runs}
+    fields = {name: smoothed[:, states.index("field")] for name, smoothed in found.smoothed_states.items()}
     levels = {name: float(field.mean()) for name, field in fields.items()}
     within, between = np.sqrt(np.mean([field.var() for field in fields.values()])), np.std(list(levels.values()))
     if not within < between:

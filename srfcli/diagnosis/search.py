@@ -203,7 +203,7 @@ class ModelSearch:
         self.count = 0
         self._expected: dict[str, float] = {}  # the most that was expected of each effect beside the baseline
         self._taken: set[tuple[Callable[[Fitted], Any], str]] = set()  # steps, and of which model
-        self._trials: dict[str, _Trial] = {}  # models that were begun from the start values of the file
+        self._trials: dict[str, _Trial | None] = {}  # models that were begun from the start values of the file
         self._finished: set[str] = set()  # models that were fitted from the start values of the file
         self._tried: dict[str, tuple[bool, Array]] = {}  # each other ageing law: whether to its maximum, and from where, last
 
@@ -781,7 +781,7 @@ class ModelSearch:
         if not self.experiment.runs:
             self._try_ageing_laws(best)
             return
-        models = [hypothesis for hypothesis, _ in self._other_laws(best)]
+        models = self._other_laws(best)
         singles = [Hypothesis((effect,)) for effect in ([] if base.passes or best.passes else self._absent_effects(base))]
         for single in sorted(singles, key=lambda h: -self._expected.get(h.name, -np.inf)):
             known = self.fitted.get(single.name)
@@ -821,10 +821,14 @@ class ModelSearch:
         return others, highest
 
     def _trial(self, hypothesis: Hypothesis) -> _Trial | None:
-        """Return where a few steps lead from the start values of the file, under a wide field and white gauge noise."""
-        if hypothesis.name in self._trials:
-            return self._trials[hypothesis.name]
-        name = hypothesis.effects[-1].reported if hypothesis.effects else hypothesis.ageing
+        """Return where a few steps lead from the start values of the file; None where these cannot be followed."""
+        if hypothesis.name not in self._trials:
+            self._trials[hypothesis.name] = self._begun_from_start_values(hypothesis)
+        return self._trials[hypothesis.name]
+
+    def _begun_from_start_values(self, hypothesis: Hypothesis) -> _Trial | None:
+        """Begin a model from the start values of the file, under a wide field and white gauge noise."""
+        name = hypothesis.effects[-1].reported if hypothesis.effects else hypothesis.ageing.partition("+")[0]
         beside = self._likelihood(hypothesis, self.baseline, name)
         if beside is None:
             return None
@@ -833,8 +837,7 @@ class ModelSearch:
         if start is None:
             return None
         found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
-        trial = self._trials[hypothesis.name] = _Trial(hypothesis, beside, own, found)
-        return trial
+        return _Trial(hypothesis, beside, own, found)
 
     def _with_a_second(self, trial: _Trial) -> _Trial | None:
         """Return the likeliest model of one effect more, begun from the start values of the file; None if none is far likelier.
@@ -896,18 +899,21 @@ class ModelSearch:
         best model has an effect, or another law than the stated one, each is scored to its maximum: the right one lies far off.
         """
         whole = bool(best.hypothesis.reported)
-        reached = [(law[0], *near) for law in self._other_laws(best) if (near := self._maximum_near_parents(*law, whole))]
+        reached = []
+        for law in self._other_laws(best):
+            own = self._likelihood(law, self.baseline, law.ageing.partition("+")[0])
+            if own is not None and (near := self._maximum_near_parents(law, own, whole)):
+                reached.append((law, *near))
         for number, (hypothesis, likelihood, found) in enumerate(sorted(reached, key=lambda r: -r[2].expected)):
             if number == 0 and found.away > 1.0:
                 found = maximise(likelihood, found.point.x, steps=TRIAL_STEPS, close=1.0, widths=(), progress=self.progress)
             self._push([move] if (move := self._move_from(hypothesis, likelihood, found)) else [])
 
-    def _other_laws(self, best: Fitted) -> list[tuple[Hypothesis, Likelihood]]:
-        """Return the ageing laws that neither the baseline nor the best model has, each with its likelihood."""
+    def _other_laws(self, best: Fitted) -> list[Hypothesis]:
+        """Return the ageing laws that neither the baseline nor the best model has."""
         stated, *modifiers = self.experiment.choice.ageing.split("+")
-        others = ((name, Hypothesis((), "+".join([name, *modifiers]))) for name in self.laws if name != stated)
-        own = ((h, self._likelihood(h, self.baseline, name)) for name, h in others if h != best.hypothesis)
-        return [(hypothesis, likelihood) for hypothesis, likelihood in own if likelihood is not None]
+        others = (Hypothesis((), "+".join([name, *modifiers])) for name in self.laws if name != stated)
+        return [hypothesis for hypothesis in others if hypothesis != best.hypothesis]
 
     def _maximum_near_parents(
         self, hypothesis: Hypothesis, likelihood: Likelihood, whole: bool = False

@@ -235,12 +235,11 @@ def field_correlation(found: StateSpaceFit) -> float:
     """Return the mean correlation of the smoothed fields of any two runs over the slip that both have; 0 where none has any."""
     if found.smooth or len(found.likelihood.problem.runs) < 2:
         return 0.0
-    point = found.likelihood.at(found.maximum.point.x, slopes=False, keep=True)
-    fields = {f.run.name: (f.run, f.smoothed().mean) for f in point.runs}
+    fields = [(run, found.smoothed_states[run.name]) for run in found.likelihood.problem.runs]
     states = found.likelihood.problem.model.states
     length = found.values["field_length"]
     products, first, second = 0.0, 0.0, 0.0
-    for (a, x), (b, y) in combinations(fields.values(), 2):
+    for (a, x), (b, y) in combinations(fields, 2):
         s, r = slip_along(a, x, states), slip_along(b, y, states)
         where = np.arange(max(s[0], r[0]), min(s[-1], r[-1]), 0.5 * length)
         if where.size < 10:

@@ -983,6 +983,12 @@ class StateSpaceFit:
         """Return the log likelihood at the maximum."""
         return self.maximum.point.log_likelihood
 
+    @cached_property
+    def smoothed_states(self) -> dict[str, Array]:
+        """Return the states (n, n_states and those of gauge noise) of each fitted run, by name, given all its readings."""
+        point = self.likelihood.at(self.maximum.point.x, slopes=False, keep=True)
+        return {f.run.name: f.smoothed().mean for f in point.runs}
+
     def predictive(self, run: Run, sizes: Mapping[str, tuple[float, float]] | None = None) -> Predictive:
         """Return how well a run that was not fitted is predicted, with the parameters as uncertain as they are.
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import SrfError
+from srfcli.core.errors import NoContact, SrfError
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
@@ -256,11 +256,7 @@ class SampledLoad(Load):
         if not (np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()):
             raise SrfError("a sampled load needs finite loads at rising times", "drop gaps and repeated times first")
         if values.min() <= 0:
-            raise SrfError(
-                f"the load is {values.min():g} N at t = {t[values.argmin()]:g} s",
-                "the slider must stay in contact",
-                kind="no contact",
-            )
+            raise NoContact(f"the load is {values.min():g} N at t = {t[values.argmin()]:g} s", "the slider must stay in contact")
         self.times, self.W, self.noise = t, values, float(noise)
         self.knots, self.coefficients, self.breaks = _build(t, values, self.noise)
         self._check_contact()
