@@ -426,12 +426,12 @@ class ModelSearch:
         if best.passes:  # other laws are tried near it alone, unless field or noise are there to make up for a law
             masked = noise_is_implausible(base.fit) and best.random and not best.hypothesis.ageing
             steps: list[_Step] = [(self._refit_from_start_values, base)] if masked else []
-            steps += [(self._try_ageing_laws, best), (self._expand_without_field, base)]
+            steps += [(self._try_rivals, best), (self._try_ageing_laws, best), (self._expand_without_field, base)]
         else:
             steps = [(self._refit_from_start_values, base)]
             steps += [(self._try_ageing_laws, best)] if best.hypothesis.ageing else []
             steps += [(self._expand_without_field, f) for f in (base, best)]
-        return [*steps, (self._try_rivals, best), *self._simplifying()]
+        return [*steps, *self._simplifying()]
 
     def _simplifying(self) -> list[_Step]:
         """Return the steps that lead from the model that is the best now to others that are as simple, or simpler."""

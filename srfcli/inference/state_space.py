@@ -409,6 +409,7 @@ class Likelihood:
         self.base_rtol, self.rtol = rtol, FREE_RUNNING_RTOL_FACTOR * rtol if smooth else rtol
         self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
+        self._last: dict[str, tuple[Array, Filtered]] = {}  # each run as it was filtered last, and where
         scales = _scales(problem.runs) if problem.runs else {}
         self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
         own = dict.fromkeys(kind for run in problem.runs for kind in self.kinds_of(run))
@@ -504,15 +505,7 @@ class Likelihood:
         self, run: Run, values: Mapping[str, float], *, slopes: bool = False, keep: bool = False, most: int | None = None
     ) -> Filtered:
         """Return one run filtered under values by name, with derivatives by the names that it depends on."""
-        gauges, problem = self.gauges(run), self.problem
-        varying = problem.varied(run)
-        own = {name: n for n, name in varying.items()} | {n: n for gauge in gauges for n in gauge.values()}
-        others = {name for names in problem.varying.values() for name in names.values()} | {*problem.experiment.elsewhere(run)}
-        by = {
-            n: own.get(n, n)
-            for n in self.names
-            if n in own or (n not in others and ("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
-        }
+        gauges, problem, by = self.gauges(run), self.problem, self._dependences(run)
         for farthest in (np.inf, MAX_UPDATE):  # held back where it cannot be followed otherwise
             found = filter_run(
                 problem.model, problem.experiment, run, problem.local(run, values), by=tuple(by.values()) if slopes else (),
@@ -522,6 +515,17 @@ class Likelihood:
             if found.whole:
                 break
         return replace(found, names=tuple(by) if slopes else ())
+
+    def _dependences(self, run: Run) -> dict[str, str]:
+        """Return the names that a run depends on, by those that `filter_run` has."""
+        problem = self.problem
+        own = {name: n for n, name in problem.varied(run).items()} | {n: n for gauge in self.gauges(run) for n in gauge.values()}
+        others = {name for names in problem.varying.values() for name in names.values()} | {*problem.experiment.elsewhere(run)}
+        return {
+            n: own.get(n, n)
+            for n in self.names
+            if n in own or (n not in others and ("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
+        }
 
     def held_out(self, run: Run, values: Mapping[str, float]) -> Filtered:
         """Return a run that was not fitted, filtered; what belongs to it alone, a free start, a trend, is estimated.
@@ -603,8 +607,14 @@ class Likelihood:
 
         def one(run: Run) -> Filtered:
             nonlocal failed  # then the others are not needed
+            own = x[[self.names.index(n) for n in self._dependences(run)]]
+            last, known = self._last.get(run.name, (None, None))
+            if known is not None and not keep and (known.names or not slopes) and np.array_equal(own, last):
+                return known  # of what varies by group most runs do not depend
             found = self.filtered(run, values, slopes=slopes, keep=keep, most=0 if failed else most.get(run.name))
             failed = failed or not found.whole
+            if found.whole:
+                self._last[run.name] = own, found
             return found
 
         runs = tuple(self.over_runs(one))
