@@ -47,6 +47,7 @@ WAVES = {  # phases: the field, and by how much a sine leads the truth's cosine
 }  # fmt: skip
 MISSED, LESS, UNTOLD = "missed by the search", "less likely than another", "not told by the recordings"
 PROCESSES = {"white": (), "one run louder": (), "uneven": (), "gaps": (), "spikes": (), "1/f": ("relaxation", "relaxation")}
+WHITE_SHARE = 0.5  # of the noise's variance, where processes of coloured noise begin beside it
 
 
 def of_an_effect(effect: Effect, truth: Any) -> dict[str, float]:
@@ -102,6 +103,13 @@ def fitted(folder: Path, concealed: dict[str, Any]) -> tuple[str, float, float, 
         longs = {p.name: long for long, p in own_parameters(effect, problem.model).items()}
         values |= {longs.get(name, name): float(value) for name, value in of_an_effect(effect, truth).items()}
     values |= {"field_amplitude": concealed["rough"], "field_length": truth.track.length}
+    sigma = concealed["gauge"]["sigma"] * (1e-3 if concealed["rig"] == "micro-force" else 1.0)  # mN there
+    coloured = sum(name.startswith("gauge_colour") for name in likelihood.names)
+    for name in likelihood.names:
+        if name.startswith("gauge_white"):
+            values[name] = sigma * math.sqrt(WHITE_SHARE if coloured else 1.0)
+        elif name.startswith("gauge_colour"):
+            values[name] = sigma * math.sqrt((1 - WHITE_SHARE) / len(likelihood.processes))
     beside = maximise(likelihood, likelihood.coordinates(values), fixed=problem.names, close=SEARCH_TOLERANCE)  # noise and field
     white = float(np.mean(np.concatenate([f.white for f in beside.point.runs]) ** 2))
     fit = StateSpaceFit(likelihood, maximise(likelihood, beside.point.x, close=SEARCH_TOLERANCE))

@@ -247,6 +247,7 @@ def possible(varies: str, setting: Setting) -> bool:
 RIG_DRAWS = 400
 STABLE = {"paper": 1.2, "rock": 2.5, "micro": 1.5}  # spring over the critical one: a quasi-static slider must be far from it
 UNSTABLE = 0.8
+LIGHT = 0.1  # share of the load under which a small slider that is to stick and slip begins
 
 
 def draw_setup(rng: np.random.Generator, setting: Setting) -> tuple[Physics, tuple[Plan, ...]]:
@@ -260,7 +261,11 @@ def draw_setup(rng: np.random.Generator, setting: Setting) -> tuple[Physics, tup
             return p, ()
         plans = _runs(rng, setting, load)
         margin = min(p.K / max(critical_spring(p, plan), 1e-12) for plan in plans)
-        wanted = margin < UNSTABLE if setting.protocol == "stick-slip" else margin > STABLE[setting.apparatus]
+        if setting.protocol == "stick-slip":  # nothing slides steadily where that is unstable, to begin with
+            begun = min(p.K / max(critical_spring(p, replace(plan, steps=())), 1e-12) for plan in plans)
+            wanted = margin < UNSTABLE and (setting.apparatus == "paper" or begun > 1 / UNSTABLE)
+        else:
+            wanted = margin > STABLE[setting.apparatus]
         if wanted:
             return p, plans
     raise RuntimeError(f"no slider for {setting}")
@@ -427,12 +432,14 @@ def _oscillation(name: str, pace: _DriveSettings, rng: np.random.Generator, load
 
 
 def _stick_slip(name: str, setting: Setting, rng: np.random.Generator, load: float) -> Plan:
-    """A drive slow enough, under a load large enough, that the slider sticks and slips."""
+    """A drive slow enough, under a load large enough, that the slider sticks and slips; a small one's load is put on at first."""
     if setting.apparatus == "paper":
         drive = ((0.5, _perturbed(rng, 12, 0.15)), (5.0, _perturbed(rng, 8, 0.3)))
         return Plan(name, drive, _perturbed(rng, 9.5, 0.06), 0.004)
     drive = ((1.0, _log_uniform(rng, 3, 6)), (8.0, _log_uniform(rng, 1, 5)))
-    return Plan(name, drive, _perturbed(rng, load, 0.2), 0.004)
+    whole = _perturbed(rng, load, 0.2)
+    light = float(f"{LIGHT * whole:.3g}")
+    return Plan(name, drive, light, 0.004, steps=((0.5, round(whole - light, 6)),))
 
 
 # The gauge of a rig, and the kind of noise that it has.
