@@ -78,6 +78,18 @@ def fitted(experiment):
     return fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=())
 
 
+@pytest.fixture(scope="module")
+def begun(ageing):
+    """A search of it that has its baseline as the start, fitted once: for tests of what comes after."""
+    baseline = ModelSearch(SHIPPED, read_experiment(ageing, registry=SHIPPED, holdout=False), effects=FEW).fit(None)
+
+    class Begun(ModelSearch):
+        def fit(self, move):
+            return super().fit(move) if move else baseline
+
+    return Begun
+
+
 def said(folder, effects=FEW, by=ModelSearch):
     search = by(SHIPPED, read_experiment(folder, registry=SHIPPED, holdout=False), effects=effects)
     search.run()
@@ -120,18 +132,18 @@ def test_what_is_missing_is_named_on_rough_tracks(ageing):
     assert sum(h.predicted.gain for h in found.held) > 0
 
 
-def test_a_search_without_budget_ends_at_the_baseline_and_says_so(ageing):
+def test_a_search_without_budget_ends_at_the_baseline_and_says_so(ageing, begun):
     """A fit under way is given up; scores are there all the same, and a baseline that passes is not said to lack nothing."""
-    found = said(ageing, by=type("Spent", (ModelSearch,), {"spent": True}))
+    found = said(ageing, by=type("Spent", (begun,), {"spent": True}))
     assert [f.name for f in found.ranked] == ["none"] and found.verdict == "inconclusive"
     assert {s.effect.reported for s in found.scores} >= {"linker-dieterich", "viscous-drag"}
     assert any("the search ended at its budget" in reason for reason in found.reasons)
 
 
-def test_a_fit_that_the_budget_ended_is_one_that_was_left(ageing):
+def test_a_fit_that_the_budget_ended_is_one_that_was_left(ageing, begun):
     """The baseline passes, and the first other model was being fitted: nothing is said to be missing, nor that nothing is."""
 
-    class Ended(ModelSearch):
+    class Ended(begun):
         others = 0
 
         @property
@@ -168,10 +180,10 @@ def test_colour_that_no_effect_explains_is_the_gauges(tmp_path):
     assert conclude(search, read_experiment(folder, registry=SHIPPED)).verdict == "none"
 
 
-def test_where_nothing_passes_the_models_after_the_best_are_expanded(ageing):
+def test_where_nothing_passes_the_models_after_the_best_are_expanded(ageing, begun):
     """Under a test that no fit passes each model of one effect is asked what it lacks."""
 
-    class Strict(ModelSearch):
+    class Strict(begun):
         def fit(self, move):
             return replace(super().fit(move), against=("it might be better",))
 

@@ -13,9 +13,11 @@ from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiler
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.goodness_of_fit import failed_tests
 from srfcli.diagnosis.hypotheses import Hypothesis
+from srfcli.diagnosis.scores import ResidualProjection
 from srfcli.diagnosis.search import SEARCH_RTOL, ModelSearch
-from srfcli.inference.state_space import Likelihood, StateSpaceFit, maximise
+from srfcli.inference.state_space import Likelihood, StateSpaceFit, log_evidence, mass_at_bounds, maximise
 from srfcli.laws.registry import bundled_registry
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
@@ -153,11 +155,13 @@ class Stuck(ModelSearch):
         if move is not None:
             return found
         self.right = found.evidence
-        problem = self._problem(Hypothesis(), {})
-        likelihood = Likelihood(problem, processes=found.fit.likelihood.processes, rtol=SEARCH_RTOL)
+        likelihood = Likelihood(
+            Hypothesis().problem(SHIPPED, self.experiment), processes=found.fit.likelihood.processes, rtol=SEARCH_RTOL
+        )
         x = likelihood.coordinates({**found.fit.values, "D0": 0.25, "field_amplitude": 2e-3, "field_length": 0.3})
-        maximum = maximise(likelihood, x, fixed=["D0"], steps=8)
-        return self._assessed(Hypothesis(), StateSpaceFit(likelihood, maximum, 1))
+        stuck = StateSpaceFit(likelihood, maximise(likelihood, x, fixed=["D0"], steps=8), 1)
+        judged = {"separate_field_evidence": log_evidence(stuck), "mass_at_bounds": mass_at_bounds(stuck)}
+        return replace(found, fit=stuck, against=tuple(failed_tests(stuck)), projection=ResidualProjection(stuck), **judged)
 
 
 @needs_compiler
