@@ -82,7 +82,7 @@ def made_run(name: str, *, holdout: bool = False, n: int = 900, seed: int = 0, w
 
 
 def whole(run: dict[str, Any]) -> dict[str, Any]:
-    """A run with the residuals of its models, in units of the noise."""
+    """A run with the innovations of its models, in units of the noise."""
     white = [(run["observed"] - run[model]) / NOISE for model in ("baseline", "augmented")]
     return run | {"white": white, "rms": [float(np.sqrt(np.mean(z[run["used"]] ** 2))) for z in white]}
 
@@ -223,12 +223,12 @@ SENTENCES: dict[str, list[str]] = {  # in their order: what is wrong, what to do
     "none": [
         "Nothing is missing: the model explains the recordings down to the noise.",
         "What to do. Continue with the parameters below;",
-        "residuals are 3.19 times the noise in the fitted runs, 4.75 times in the held-out ones.",
+        "innovations are 3.19 times the noise in the fitted runs, 4.75 times in the held-out ones.",
     ],
     "identified": [
         "A change of the load changes the age of contacts: alpha = 0.0120(4).",
         'What to do. Add "+linker-dieterich" to the name of the ageing law, with alpha = 0.01200; continue with the augmented',
-        "Residuals fall from 3.19 to 0.99 times the noise in the fitted runs, and fall from 4.75 to 1.02 times in runs that",
+        "Innovations fall from 3.19 to 0.99 times the noise in the fitted runs, and fall from 4.75 to 1.02 times in runs that",
         "It rests on 2 fitted runs, most on “onset” (61",
     ],
     "ambiguous": [
@@ -238,7 +238,7 @@ SENTENCES: dict[str, list[str]] = {  # in their order: what is wrong, what to do
     "unknown": [
         "Something is missing that no registered effect explains.",
         "What to do. Look at the missing force below, against time and against the state, for what it goes with.",
-        "With the best that was tried, residuals fall from",
+        "With the best that was tried, innovations fall from",
     ],
     "inconclusive": [
         "Nothing has to be added, but this experiment could not have seen most effects of a size that matters.",
@@ -298,7 +298,7 @@ def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Pat
     first = page.text.partition("PMMA <on> PMMA: " + verdict)[2]
     places = [first.find(sentence) for sentence in SENTENCES[verdict]]
     assert -1 not in places and places == sorted(places), places
-    assert places[-1] < first.index("residual / noise") < first.index("What was left out")
+    assert places[-1] < first.index("innovations / noise") < first.index("What was left out")
     nothing = verdict in ("none", "inconclusive")
     assert ("No place stands out beyond what noise does." in page.text) == nothing
     place = "61 % of the excess misfit is in the run “onset”, most from 1.00 to 1.50 s."
@@ -499,7 +499,7 @@ def test_residuals_that_read_alike_do_not_fall(tmp_path: Path) -> None:
     answer = made_answer("unknown")
     answer["baseline"]["fit"]["rms_over_noise"], answer["augmented"]["fit"]["rms_over_noise"] = 1.004, 1.001
     write_report(tmp_path, answer, made_material("unknown"))
-    assert "residuals stay at 1.00 times the noise in the fitted runs" in read(tmp_path).text
+    assert "innovations stay at 1.00 times the noise in the fitted runs" in read(tmp_path).text
 
 
 def test_a_boundary_is_drawn_once_where_nothing_was_added() -> None:

@@ -44,7 +44,7 @@ HYPOTHESES = (
     Column("hypothesis", "", "effects added to the baseline"),
     Column("evidence", "1", "log marginal likelihood over that of the baseline", ".1f"),
     Column("rms_over_noise", "1", "of the innovations: 1 where all but noise is explained", ".4f"),
-    Column("field", "1", "amplitude of the random friction that it needs", ".2g"),
+    Column("field", "1", "amplitude of its friction field", ".2g"),
     Column("confidence", "1", "stated", ".3f"),
     Column("against", "", "what speaks against it"),
 )
@@ -92,7 +92,7 @@ class DiagnosisResult(Result):
     diagnosis : Diagnosis
         The fits of the models that were compared, their evidence, and the verdict.
     location : Location
-        Where the baseline's residual stands out: in time, velocity, load, slip and phase, in um, s, N.
+        Where the baseline's innovations stand out: in time, velocity, load, slip and phase, in um, s, N.
     registry : Registry
         The effects that were looked for.
     missing : mapping
@@ -190,7 +190,7 @@ class DiagnosisResult(Result):
         rows = [tuple(r[k] for k in keys) for r in self._parameters]
         notes = []
         if self.answer["baseline"] != self.answer["augmented"]:
-            notes.append("the baseline is fitted with the augmented model's field and gauge noise, to show what it lacks")
+            notes.append("the baseline has the augmented model's friction field and gauge noise, to show what it lacks")
         notes += self._alternatives
         return Table("srf.diagnose.parameters/1", PARAMETERS, rows, "parameters", tuple(notes))
 
@@ -256,7 +256,7 @@ class DiagnosisResult(Result):
         return made
 
     def plot(self, ax: Axes | None = None) -> Figure:
-        """Return the run that the verdict rests on most: recording, both models, residuals, random friction, what was imposed.
+        """Return the run that the verdict rests on most: recording, both models, innovations, friction field, what was imposed.
 
         Without runs it is the first table of critical loads, under both models.
         """
@@ -364,8 +364,12 @@ def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:
         held = side["holdout"]["rms_over_noise"]
         rest = "" if held is None else f", {held:.4g} in those held out"
         field = side["field"]
-        track = "needs no random friction" if field is None else f"needs random friction of {field['amplitude']:.2g}"
-        like = "with the augmented model's field and gauge noise, " if name == "baseline" and side != found["augmented"] else ""
+        track = "needs no friction field" if field is None else f"needs a friction field of amplitude {field['amplitude']:.2g}"
+        like = (
+            "with the augmented model's friction field and gauge noise, "
+            if name == "baseline" and side != found["augmented"]
+            else ""
+        )
         told = f"rms over noise {side['fit']['rms_over_noise']:.4g} in"
         if recorded:
             notes.append(f"{name}: {track}; {like}{told} the runs fitted{rest}")
@@ -385,7 +389,7 @@ def _missing(missing: dict[str, Any]) -> list[str]:
     if not missing:
         return []
     latent = missing["latent"]
-    notes = [f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"]
+    notes = [f"no effect explains a friction field of amplitude {latent['amplitude']:.2g} over {latent['length']:.2g} um of slip"]
     for name, share in list(latent["coordinates"].items())[:1]:
         notes[0] += f"; a function of {name} is {100 * share:.0f} % of it"
     if missing["form"] is None and not missing["searched"]:
@@ -405,10 +409,10 @@ def _places(location: Location) -> list[str]:
         notes.append("the misfit goes with the forcing: {:.2f} to {:.2f} rad after its maximum".format(*location.forcing_phase))
     if location.frequencies:
         lines = ", ".join(f"{f:.4g}" for f in location.frequencies)
-        notes.append(f"the baseline's residuals have lines in their spectrum at {lines} Hz")
+        notes.append(f"the baseline's innovations have lines in their spectrum at {lines} Hz")
     if location.coordinate is not None:
         name, share = location.coordinate
-        notes.append(f"a function of {name} alone explains {100 * share:.0f} % of the residuals' power")
+        notes.append(f"a function of {name} alone explains {100 * share:.0f} % of the innovations' power")
     return notes
 
 

@@ -26,6 +26,7 @@ from srfcli.results.provenance import sidecar_path
 from srfcli.results.report_text import (
     NO_BREAK,
     bracketed,
+    definitions,
     finite,
     format_with_error,
     gain_sentence,
@@ -53,7 +54,7 @@ SHIFTED = 3.0  # standard errors from which a parameter is said to be shifted
 WIDTH = 0.05  # of a span: windows that are less apart are one in words
 SHADED = (
     "Shaded are the times at which the baseline differs from the recording, the darker the more; that its parameters may have "
-    "been shifted to follow elsewhere is allowed for, so a residual may also be large outside."
+    "been shifted to follow elsewhere is allowed for, so an innovation may also be large outside."
 )
 FILES = ("answer.json", "prediction-*.csv", "missing-*.csv", "augmented/**/*", "discriminating/**/*", "figures/*.svg")
 
@@ -121,7 +122,8 @@ def numbers(matter: Matter) -> Markup:
         values = [rms_of(matter.answer, m, part) for m in matter.sides("baseline", "augmented")]
         if any(v is not None for v in values):
             rows.append([label, *map(rms, values)])
-    parts = [table(["residual / noise", *matter.sides()], rows, numeric=(1, 2))] if rows else []
+    head = "innovations / noise" if matter.traces else "residuals / error"
+    parts = [table([head, *matter.sides()], rows, numeric=(1, 2))] if rows else []
     confidence = sorted((matter.answer.get("confidence") or {}).items(), key=lambda kv: -(kv[1] or 0.0))
     shown = [[CONFIDENCE_IN.get(name, name), [percent(p), bar(p)]] for name, p in confidence if finite(p) and p >= 0.005][:5]
     if shown:
@@ -136,7 +138,7 @@ def places(matter: Matter) -> Markup:
     caption = "Every run on its own clock; light is noise, dark is what the model does not explain."
     if any(t.windows for t in matter.traces):
         caption += " A black line marks the times that are shaded darkest in the figures of the runs."
-    alt = "All runs as strips over time, dark where the residual exceeds the noise."
+    alt = "All runs as strips over time, dark where innovations exceed the noise."
     parts: list[Any] = [
         tag("p", " ".join(_location_sentences(matter))),
         matter.figure("overview", alt, caption),
@@ -171,9 +173,9 @@ def critical_loads(matter: Matter) -> list[Any]:
 
 
 def _run_table(matter: Matter) -> Markup:
-    """Return the fitted runs with their residuals and, where any stands out, their parts of the misfit."""
+    """Return the fitted runs with their innovations and, where any stands out, their parts of the misfit."""
     located, rows = {r["name"]: r for r in matter.located}, []
-    heads, caption = ["run", *matter.sides()], "Residual over noise of each fitted run"
+    heads, caption = ["run", *matter.sides()], "Innovations over noise (rms) of each fitted run"
     last = len(heads)
     if located:
         heads += ["share of the excess", "p of noise", "stands out at"]
@@ -245,10 +247,10 @@ def _run(matter: Matter, one: report_figures.Trace) -> Markup:
     before, after = one.rms
     fell = f"{rms(before)}" if matter.same else f"{rms(before)} before, {rms(after)} after"
     where = f"; they differ at the shaded times, furthest from {spans([one.worst])}" if one.worst else ""
-    alt = f"Run {one.name}: recording, simulations and residuals over time{where}."
-    caption = f"{one.name}: residual over noise {fell}{where}. Dotted lines: two standard deviations of the noise."
-    if one.unexplained is not None:
-        caption += " Random friction is what each model, left to itself, takes for the track's."
+    alt = f"Run {one.name}: recording, predictions and innovations over time{where}."
+    caption = f"{one.name}: innovations over noise (rms) {fell}{where}. Dotted lines: two standard deviations of the noise."
+    if one.friction_field is not None:
+        caption += " The friction field is that of each model fitted by itself, as the smoother estimates it."
     return matter.figure(f"run {one.name}", alt, caption)
 
 
@@ -300,10 +302,10 @@ def hypotheses(matter: Matter) -> Markup:
         sure = percent(r.get("confidence"))
         rows.append([label, evidence, rms(r["rms_over_noise"]), field, sure, r.get("against") or ""])
     caption = (
-        "Everything that was fitted in full, best first: log evidence against the best, innovations over noise, the amplitude of "
-        "the random friction that it needs besides, and what speaks against it."
+        "Everything that was fitted in full, best first: log evidence against the best, innovations over noise (rms), the "
+        "amplitude of the friction field, and what speaks against it."
     )
-    heads = ["hypothesis", "log evidence", "innovations / noise", "random friction", "confidence", "against it"]
+    heads = ["hypothesis", "log evidence", "innovations / noise", "friction field", "confidence", "against it"]
     return table(heads, rows, caption=caption, numeric=(1, 2, 3, 4), chosen=chosen)
 
 
@@ -368,17 +370,17 @@ def held_out(matter: Matter) -> Markup:
     heads = ["run", *matter.sides("baseline", "augmented model", "predicted")]
     text = "These were opened only after the model was final."
     shown = [_run(matter, one) for one in matter.held[:RUNS_SHOWN]]
-    found = table(heads, rows, caption="Residual over noise.", numeric=(1, 2))
+    found = table(heads, rows, caption="Innovations over noise (rms).", numeric=(1, 2))
     return section("held-out", "Runs that the fit never saw", tag("p", text), found, shown)
 
 
 def missing_force(matter: Matter) -> Markup:
-    """Return the force that is missing, against time and state, and its closed form; nothing where it was not estimated."""
+    """Return the missing force against time and state, and its closed form; nothing where it was not estimated."""
     force = matter.material.get("force") or {}
     if not force:
         return Markup("")
     form = force.get("form")
-    parts: list[Any] = [tag("p", "Estimated along the recording without assuming its form.")]
+    parts: list[Any] = [tag("p", "Estimated along the recording without assuming its form, under the baseline.")]
     if form:
         parts.append(tag("p", "The best closed form found for it: ", tag("code", str(form))))
     drawn = [name for name in matter.pictures if name.startswith("force ")]
@@ -561,6 +563,7 @@ def _page(matter: Matter) -> str:
         tag("h1", tag("span", verdict, class_=f"verdict {verdict}"), sentence),
         tag("p", tag("strong", "What to do. "), remedy(matter.answer, matter.material), class_="lead"),
         tag("p", gain_sentence(matter.answer, matter.material), class_="lead"),
+        tag("p", text) if (text := definitions(matter.material)) else "",
         _run(matter, matter.fitted[0]) if matter.fitted else "",
         numbers(matter),
     ]
@@ -646,7 +649,7 @@ def _headline(data: Mapping[str, Any]) -> str:
                 value = with_unit(bracketed(row.get("value"), row.get("stderr")), row.get("unit"))
                 told.append(f"{row['parameter']} = {value}")
         ratio = ((data.get("meta") or {}).get("rms_over_noise") or {}).get("fit")
-        tail = f"; residuals are {number(ratio)} times the noise" if finite(ratio) else ""
+        tail = f"; innovations are {number(ratio)} times the noise" if finite(ratio) else ""
         if finite(best.get("chi2")):
             tail = f"; χ² is {number(best['chi2'])} on {best.get('freedom')} degrees of freedom"
         if (data.get("meta") or {}).get("against"):
@@ -678,7 +681,7 @@ def _result(folder: Path, path: Path, data: Mapping[str, Any]) -> Markup:
     runs = (data.get("meta") or {}).get("runs")
     if isinstance(runs, list) and runs and isinstance(runs[0], dict) and "rms_over_noise" in runs[0]:
         rows = [[r["run"], r["role"], r.get("used", r.get("samples")), number(r["rms_over_noise"])] for r in runs]
-        heads = ["run", "role", "samples", "residual / noise"]
+        heads = ["run", "role", "samples", "innovations / noise"]
         parts.append(table(heads, rows, caption="How each run is fitted.", numeric=(2, 3)))
     notes = [str(n) for n in data.get("notes") or ()]
     if notes:

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis' report: runs and residuals, the residual scan, what was found."""
+"""Figures of a diagnosis' report: runs and innovations, the residual scan, what was found."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Figures of where the model differs from the recording: all runs at a glance, and each run with its residual before and after.
+# Figures of where the model differs from the recording: all runs at a glance, and each run with its innovations before and after.
 
 Array = NDArray[np.float64]
 
 OBSERVED_COLOUR, BASELINE_COLOUR, AUGMENTED_COLOUR, MISFIT_COLOUR = "#333333", "#D55E00", "#0072B2", "#E69F00"
-PIECES, PIECE_SAMPLES = 60, 24  # pieces of a run whose residual is judged, samples that make a piece
-RESIDUAL_COLUMNS = 360  # in which a residual is drawn by its extremes
+PIECES, PIECE_SAMPLES = 60, 24  # pieces of a run whose innovations are judged, samples that make a piece
+INNOVATION_COLUMNS = 360  # in which innovations are drawn by their extremes
 DOTS = 700  # samples that are drawn one by one
 CLOSE_UP_PERIODS, CLOSE_UP_SAMPLES = 7, 80  # periods of what is missing that a close-up shows, samples at least
 MOST_OF_MISFIT, SHORT_PART = 0.6, 0.12  # of the misfit, in a part of the run so short that it deserves a close-up
-PEAK_SHARE = 0.3  # of a residual's power in one line, from which it has a period
+PEAK_SHARE = 0.3  # of the innovations' power in one line, from which it has a period
 CLOSE_UP_POWER = 2.0  # of the noise's variance: less than that needs no close-up
 ZOOM = 0.3  # of a run: a close-up of more would show nothing new
 LOAD_PANEL = 1e-3  # relative variation of a load from which it is worth a panel
@@ -45,8 +45,8 @@ class Trace:
     """One run as it is drawn: arrays (n,) of the samples that are compared, in the units of the recording.
 
     `before` and `after` are the innovations of baseline and augmented model over their standard deviations, `rms` their root
-    mean squares, infinite for a run that a model cannot follow. `unexplained` is the friction that each model leaves to its
-    random field.
+    mean squares, infinite for a run that a model cannot follow. `friction_field` is that of each model, as the
+    smoother estimates it.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Trace:
     W: Array = field(repr=False)
     windows: tuple[tuple[float, float], ...]
     rms: tuple[float, float]
-    unexplained: tuple[Array, Array] | None = field(default=None, repr=False)
+    friction_field: tuple[Array, Array] | None = field(default=None, repr=False)
 
     @property
     def same(self) -> bool:
@@ -77,7 +77,7 @@ class Trace:
         return [(before, BASELINE_COLOUR, "-"), (after, AUGMENTED_COLOUR, (0, (4, 1.2)))]
 
     def heights(self) -> tuple[float, ...]:
-        """Return for each window how far its residual is above noise, from 0 to 1 for the worst."""
+        """Return for each window how far its innovations are above noise, from 0 to 1 for the worst."""
         over = []
         for a, b in self.windows:
             z = self.before[(self.t >= a) & (self.t <= b)]
@@ -104,19 +104,19 @@ def trace(run: Mapping[str, Any]) -> Trace:
         str(run["name"]), bool(run["holdout"]), str(run["label"]), str(run["load_unit"]),
         **{k: values[good] for k, values in arrays.items()},
         windows=tuple((float(a), float(b)) for a, b in run["windows"]), rms=(before, after),
-        unexplained=(field[0][good], field[1][good]) if len(field) == 2 and any(np.any(x[good]) for x in field) else None,
+        friction_field=(field[0][good], field[1][good]) if len(field) == 2 and any(np.any(x[good]) for x in field) else None,
     )  # fmt: skip
 
 
 def local_rms(t: Array, z: Array) -> tuple[Array, Array]:
-    """Return the borders (k + 1,) of pieces of a run in s and the rms (k,) of the residual in each."""
+    """Return the borders (k + 1,) of pieces of a run in s and the rms (k,) of the innovations in each."""
     pieces = np.array_split(np.arange(t.size), max(min(PIECES, t.size // PIECE_SAMPLES), 1))
     borders = [t[p[0]] for p in pieces] + [t[-1]]
     return np.asarray(borders), np.asarray([np.sqrt(np.mean(z[p] ** 2)) for p in pieces])
 
 
 def overview(traces: Sequence[Trace], *, narrow: bool = False) -> Figure:
-    """Return all runs as strips over their own clocks, dark where the residual exceeds the noise, before and after.
+    """Return all runs as strips over their own clocks, dark where innovations exceed the noise, before and after.
 
     `narrow` sets the two models below each other, for a small screen.
     """
@@ -154,7 +154,7 @@ def overview(traces: Sequence[Trace], *, narrow: bool = False) -> Figure:
         bar = figure.colorbar(
             shade, ax=list(axes), pad=0.02, aspect=30 if narrow else 14, location="bottom" if narrow else "right"
         )
-        bar.set_label("residual / noise")
+        bar.set_label("innovations / noise")
         _plain_log(bar.ax.xaxis if narrow else bar.ax.yaxis, max(3.0, top), most=5 if narrow else 8)
         fix_layout(figure)
         return figure
@@ -171,13 +171,13 @@ def _plain_log(axis: Any, top: float, *, most: int) -> None:
 
 
 def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
-    """Return a run: recording and both models, residuals over noise, local rms, random friction, what was imposed; a close-up.
+    """Return a run: recording and both models, innovations over noise, local rms, friction field, what was imposed; a close-up.
 
     `narrow` leaves the close-up out and gives the legend a row of its own, for a small screen.
     """
     imposed = [k for k in ("V", "W") if np.ptp(getattr(one, k)) > LOAD_PANEL * float(np.abs(getattr(one, k)).max())]
     piece = None if narrow else close_up(one)
-    friction = one.unexplained is not None
+    friction = one.friction_field is not None
     heights = [3.0, 2.2, 1.1, *[1.3] * friction, *[0.75] * len(imposed)]
     with house_style():
         figure = bare_figure((NARROW_FIGURE if narrow else 10.4 if piece else 9.0, 0.72 * sum(heights) + 1.1))
@@ -186,8 +186,8 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
         axes = _column(figure, grid, 0, [slice(i, i + 1) for i in range(len(heights))])
         _shade(axes, one)
         _whole(axes, one, narrow=narrow)
-        if one.unexplained is not None:
-            _unexplained(axes[3], one)
+        if one.friction_field is not None:
+            _friction_field(axes[3], one)
         for axis, key in zip(axes[3 + friction :], imposed, strict=True):
             _imposed_panel(axis, one, key, slice(None))
         _end_column(axes)
@@ -241,7 +241,7 @@ def _whole(axes: Sequence[Axes], one: Trace, *, narrow: bool = False) -> None:
         loc="lower left" if narrow else "lower right", bbox_to_anchor=(-0.02 if narrow else 1.0, 0.99), ncols=3, fontsize=8.5,
         handlelength=1.4 if narrow else 2.4, borderaxespad=0.0, columnspacing=1.0,
     )  # fmt: skip
-    _residual(below, one)
+    _innovations(below, one)
     for z, colour, dash in one.sides(one.before, one.after):
         borders, values = local_rms(one.t, z)
         local.stairs(values, borders, baseline=None, color=colour, linestyle=dash, linewidth=1.4)
@@ -269,28 +269,28 @@ def _models(axis: Axes, one: Trace, part: slice) -> None:
     axis.margins(y=0.14)
 
 
-def _residual(axis: Axes, one: Trace) -> None:
-    """Draw both residuals over the whole run as bands between their extremes, and where noise would stay."""
+def _innovations(axis: Axes, one: Trace) -> None:
+    """Draw the innovations of both over the whole run as bands between their extremes, and where noise would stay."""
     for z, colour, _ in one.sides(one.before, one.after):
         alpha = 0.75 if colour == AUGMENTED_COLOUR else 0.55
         for a, b in _pieces(one.t):
-            if b - a < 4 * RESIDUAL_COLUMNS:
+            if b - a < 4 * INNOVATION_COLUMNS:
                 axis.plot(one.t[a:b], z[a:b], color=colour, linewidth=0.6, alpha=alpha)
                 continue
-            edges = np.unique(np.linspace(a, b, RESIDUAL_COLUMNS + 1).astype(int)[:-1])
+            edges = np.unique(np.linspace(a, b, INNOVATION_COLUMNS + 1).astype(int)[:-1])
             low, high = np.minimum.reduceat(z[:b], edges), np.maximum.reduceat(z[:b], edges)
             axis.fill_between(one.t[edges], low, high, color=colour, alpha=alpha, linewidth=0.3)
     _noise_band(axis)
-    axis.set_ylabel("residual\n/ noise")
+    axis.set_ylabel("innovation\n/ noise")
 
 
-def _unexplained(axis: Axes, one: Trace) -> None:
-    """Draw the friction that each model leaves to its random field, in thousandths."""
-    assert one.unexplained is not None
-    for values, colour, dash in one.sides(*one.unexplained):
+def _friction_field(axis: Axes, one: Trace) -> None:
+    """Draw the friction field of each model, in thousandths."""
+    assert one.friction_field is not None
+    for values, colour, dash in one.sides(*one.friction_field):
         _line(axis, one.t, 1e3 * values, color=colour, linewidth=1.1, linestyle=dash)
     axis.axhline(0.0, color="#777777", linewidth=0.8)
-    axis.set_ylabel("random\nfriction\n[10$^{-3}$]")
+    axis.set_ylabel("friction\nfield\n[10$^{-3}$]")
     axis.margins(y=0.1)
 
 
@@ -558,7 +558,7 @@ def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool =
 
 
 def force_figure(name: str, force: Mapping[str, Any], load_unit: str, *, narrow: bool = False) -> Figure:
-    """Return a run's missing friction (n,) over time with its band (2, n), above slip velocity and load."""
+    """Return a run's missing force over the load (n,), over time with its band (2, n), above slip velocity and load."""
     t = np.asarray(force["t"], dtype=float)
     imposed = (("v", "v\n[µm/s]"), ("W", f"W\n[{load_unit}]"))
     with house_style():
@@ -570,7 +570,7 @@ def force_figure(name: str, force: Mapping[str, Any], load_unit: str, *, narrow:
         axes[0].axhline(0, color="#777777", linewidth=0.8)
         axes[0].set_title(name_text(name, narrow=narrow), pad=22 if narrow else None)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=2, fontsize=8.5, borderaxespad=0.0)
-        axes[0].set_ylabel("missing friction\ncoefficient")
+        axes[0].set_ylabel("missing force\n/ load")
         for axis, (key, label) in zip(axes[1:], imposed, strict=True):
             known = np.asarray(force[key], dtype=float)
             axis.plot(*envelope(t, known), color="#555555", linewidth=0.8)
@@ -586,7 +586,7 @@ def force_figure(name: str, force: Mapping[str, Any], load_unit: str, *, narrow:
 
 
 def force_by_state(forces: Mapping[str, Mapping[str, Any]], load_unit: str, *, narrow: bool = False) -> Figure | None:
-    """Return the missing friction of all runs against slip velocity, age and load, averaged in pieces; None if none varies."""
+    """Return the missing force of all runs over slip velocity, age and load, averaged in pieces; None if none varies."""
     shown = [s for s in STATES if any(np.ptp(f[s[0]]) > 0 for f in forces.values())]
     if not shown:
         return None
@@ -606,7 +606,7 @@ def force_by_state(forces: Mapping[str, Mapping[str, Any]], load_unit: str, *, n
             if log:
                 axis.set_xscale("log")
                 decade_ticks(axis)
-        axes[0].set_ylabel("missing friction coefficient")
+        axes[0].set_ylabel("missing force / load")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
         fix_layout(figure)
         return figure

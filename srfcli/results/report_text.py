@@ -71,7 +71,7 @@ def percent(share: Any) -> str:
 
 
 def rms(value: Any) -> str:
-    """Return a residual in units of the noise: two decimals, fewer where it is large."""
+    """Return innovations in units of the noise: two decimals, fewer where they are large."""
     if not finite(value):
         return "–"
     return f"{value:.2f}" if value < 9.995 else number(value, 3)
@@ -142,14 +142,14 @@ def remedy(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
 def gain_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     """Return what is gained by the better model, and on what that rests."""
     verdict = answer.get("verdict")
-    track = _random_friction(answer)
+    track = _friction_field(answer)
     if verdict in ("none", "inconclusive"):
-        level = _level(answer, "baseline")
+        level = _level(answer, material, "baseline")
         return f"With the model as it is{level}{f'; {track}' if track else ''}." if level else ""
     ranked = [r for r in material.get("ranked", ()) if finite(r.get("evidence"))]
     zero = next((r["evidence"] for r in ranked if r.get("name") == "none"), None)
     told = next((r for r in ranked if r.get("told")), None) if verdict == "identified" else None
-    parts = [f"{'With the best that was tried, ' if verdict in ('unknown', 'ambiguous') else ''}{_fell(answer)}"]
+    parts = [f"{'With the best that was tried, ' if verdict in ('unknown', 'ambiguous') else ''}{_fell(answer, material)}"]
     if told and zero is not None and told["evidence"] > zero:
         parts.append(f"the log evidence rises by {number(told['evidence'] - zero)}")
     parts += [track] if track else []
@@ -229,19 +229,24 @@ def _about(effect: str, material: Mapping[str, Any]) -> str:
     return text[:1].lower() + text[1:] if text[1:2].islower() else text
 
 
-def _level(answer: Mapping[str, Any], key: str) -> str:
+def _left(material: Mapping[str, Any]) -> str:
+    """Return what a model leaves: of recordings innovations, of critical loads residuals."""
+    return "innovations" if material.get("runs") or not material.get("thresholds") else "residuals"
+
+
+def _level(answer: Mapping[str, Any], material: Mapping[str, Any], key: str) -> str:
     fit, held = (rms_of(answer, key, part) for part in ("fit", "holdout"))
     if fit is None:
         return ""
     held_out = f", {rms(held)} times in the held-out ones" if held is not None else ""
-    return f" residuals are {rms(fit)} times the noise in the fitted runs{held_out}"
+    return f" {_left(material)} are {rms(fit)} times the noise in the fitted runs{held_out}"
 
 
-def _fell(answer: Mapping[str, Any]) -> str:
+def _fell(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     before, after = rms_of(answer, "baseline", "fit"), rms_of(answer, "augmented", "fit")
     if before is None or after is None:
-        return "the residuals change as shown below"
-    text = f"residuals {_changed(before, after)} times the noise in the fitted runs"
+        return f"the {_left(material)} change as shown below"
+    text = f"{_left(material)} {_changed(before, after)} times the noise in the fitted runs"
     held = rms_of(answer, "baseline", "holdout"), rms_of(answer, "augmented", "holdout")
     if held[0] is None or held[1] is None:
         return text
@@ -255,17 +260,30 @@ def _changed(before: float, after: float) -> str:
     return f"{'fall' if after < before else 'rise'} from {rms(before)} to {rms(after)}"
 
 
-def _random_friction(answer: Mapping[str, Any]) -> str:
-    """Return how the random friction changes that each model needs besides; nothing where neither needs any."""
+def _friction_field(answer: Mapping[str, Any]) -> str:
+    """Return how the amplitude of the friction field changes; nothing where neither model needs one."""
     if any("field" not in (answer.get(side) or {}) for side in ("baseline", "augmented")):
         return ""
     before, after = ((answer[side]["field"] or {}).get("amplitude", 0.0) for side in ("baseline", "augmented"))
     if not (before or after):
         return ""
     if before == after:
-        return f"the random friction that it takes for the track's is {number(before, 2)}"
+        return f"the amplitude of its friction field is {number(before, 2)}"
     said = [number(x, 2) if x else "nothing" for x in (before, after)]
-    return f"the random friction that the model takes for the track's goes from {said[0]} to {said[1]}"
+    return f"the amplitude of the friction field goes from {said[0]} to {said[1]}"
+
+
+def definitions(material: Mapping[str, Any]) -> str:
+    """Return what innovations, the friction field and the missing force are; nothing where no recording was fitted."""
+    if not material.get("runs"):
+        return ""
+    told = [
+        "An innovation is a reading less its prediction from the readings before it; the noise is its standard deviation.",
+        "The friction field is a random variation of mu0 along slip that a model needs beside its laws.",
+    ]
+    if material.get("force"):
+        told.append("The missing force is the friction field as the smoother estimates it from all readings, over the load.")
+    return " ".join(told)
 
 
 def rms_of(answer: Mapping[str, Any], model: str, part: str) -> float | None:
