@@ -20,7 +20,6 @@ from sound_files import EXPERIMENT, SETTINGS, THRESHOLDS, recording
 
 from srfcli.cli.main import cli
 from srfcli.cli.options import parse_over
-from srfcli.cli.simulate import parse_pieces
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import load_toml, resolve
 from srfcli.core.units import dimension, parse_quantity
@@ -30,6 +29,7 @@ from srfcli.data.thresholds import read_thresholds
 from srfcli.laws.expression import parse_expression
 from srfcli.laws.law_file import read_header, template
 from srfcli.laws.registry import bundled_registry, read_law, scan_python
+from srfcli.tasks.simulate import read_pieces
 from srfcli.validation.blind import Answer, read_answers, to_line
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -469,8 +469,8 @@ def test_any_number(text: str) -> None:
         lambda: dimension(text),
         lambda: parse_over(text),
         lambda: parse_over(f"V={text}"),
-        lambda: parse_pieces(text, "um/s", option="--drive", example="1:5"),
-        lambda: parse_pieces(f"1:{text}", "um/s", option="--drive", example="1:5"),
+        lambda: read_pieces(text, "um/s", name="drive", example="1:5"),
+        lambda: read_pieces(f"1:{text}", "um/s", name="drive", example="1:5"),
     ):
         try:
             parse()

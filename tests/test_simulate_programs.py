@@ -5,23 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from srfcli.cli.simulate import parse_pieces, parse_rates
 from srfcli.core.errors import SrfError
 from srfcli.motion.imposed import Drive
 from srfcli.results.simulation import Rows
-from srfcli.tasks.simulate import sample_times, usual_rate
+from srfcli.tasks.simulate import read_pieces, read_rates, sample_times, usual_rate
 
 
 def test_pieces_with_units_and_ramps() -> None:
-    assert parse_pieces("0.5:12, 4:8", "um/s", option="--drive", example="") == ((0.5, 12, 12), (4, 8, 8))
-    assert parse_pieces("2 s : 5 -> 7 N", "N", option="--load", example="") == ((2, 5, 7),)
-    assert parse_pieces("2:0.001 mm/s -> 5 um/s", "um/s", option="--drive", example="") == ((2, 1, 5),)
-    drive = Drive.sequence(parse_pieces("1:10, 2:10->20, 1:0", "um/s", option="--drive", example=""), start=5.0)
+    assert read_pieces("0.5:12, 4:8", "um/s", name="drive", example="") == ((0.5, 12, 12), (4, 8, 8))
+    assert read_pieces("2 s : 5 -> 7 N", "N", name="load", example="") == ((2, 5, 7),)
+    assert read_pieces("2:0.001 mm/s -> 5 um/s", "um/s", name="drive", example="") == ((2, 1, 5),)
+    drive = Drive.sequence(read_pieces("1:10, 2:10->20, 1:0", "um/s", name="drive", example=""), start=5.0)
     assert drive(np.array([5.0, 5.5, 7.0, 8.0, 9.0])).tolist() == [10.0, 10.0, 15.0, 0.0, 0.0]
 
 
 def test_sample_times_meet_the_pieces() -> None:
-    t = sample_times([1.0, 100.0, 2.0], parse_rates("100, 1, 50", 3), 0.0)
+    t = sample_times([1.0, 100.0, 2.0], read_rates("100, 1, 50", 3), 0.0)
     assert t.size == 100 + 100 + 101 and t[0] == 0.0 and t[-1] == 103.0
     assert (np.diff(t) > 0).all() and {1.0, 101.0} <= set(t.tolist())
     assert t[:4].tolist() == [0.0, 0.01, 0.02, 0.03]

@@ -41,7 +41,6 @@ from srfcli.core.units import convert, parse_quantity, split_quantity, tidy
 from srfcli.results.plots import check_plot
 
 if TYPE_CHECKING:
-    from srfcli.codegen.model import GeneratedModel
     from srfcli.codegen.slider import Opener, SlidingSystem
     from srfcli.laws.registry import Registry
 
@@ -267,12 +266,6 @@ class SystemOptions:
         from srfcli.codegen.slider import Opener
 
         return Opener(self.registry(), self._names(), self.effects)
-
-    def model(self, *, tables: Sequence[tuple[str, str]]) -> GeneratedModel:
-        """Return the numerical model of that system with tables; sympy runs only where the cache has none."""
-        from srfcli.codegen.model import open_model
-
-        return open_model(self.registry(), **self._names(), tables=tables, effects=self.effects)
 
     def resolve(self, parameters: Sequence[Parameter], **given: str | float | None) -> Resolved:
         """Return every parameter's value and origin.

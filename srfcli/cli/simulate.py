@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,17 +10,13 @@ import click
 
 from srfcli.cli.base import Session, SrfCommand
 from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-from srfcli.cli.options import LAW_CHOICES, PATH, OutputOptions, SystemOptions, options_with_effects, output_options, value_option
+from srfcli.cli.options import PATH, OutputOptions, SystemOptions, options_with_effects, output_options, value_option
 from srfcli.core.errors import SrfError
-from srfcli.core.units import convert, parse_quantity, split_quantity
 from srfcli.motion import STEP_RISE
 from srfcli.results.provenance import Provenance, sidecar, sidecar_path
 
 if TYPE_CHECKING:
-    from srfcli.data.noise import FrictionField
-    from srfcli.data.values import ModelChoice
-    from srfcli.motion.imposed import Load
-    from srfcli.results.simulation import SimulationResult, Work
+    from srfcli.results.simulation import SimulationResult
 
 EXAMPLES = """
 srf simulate --V 8 --W0 9 --eps 0.09 --for 4 --rate 1000 --out run.csv
@@ -36,6 +31,7 @@ OWN_RECORD = {  # options that describe a new record; they exclude EXPERIMENT, w
     "V": "--V", "W0": "--W0", "eps": "--eps", "drive": "--drive", "load": "--load", "load_file": "--load-file",
     "onset": "--onset", "duration": "--for", "rate": "--rate", "observable": "--observe", "free": "--free",
 }  # fmt: skip
+NOT_TOLD = ("V", "W0", "eps", "runs")  # options that are parameters of the slider, or of an experiment
 EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load_file"), ("load", "load_file"))
 
 
@@ -103,22 +99,22 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
     Drive and load are programs of pieces, or those of the runs of EXPERIMENT, a folder or its experiment.toml. Errors are
     controlled; slip velocities may fall to 1e-12 um/s and below. The records can be written as a new experiment, with noise.
     """
-    from srfcli.tasks.simulate import simulate_work
+    from srfcli.tasks import simulate as task
 
     _check(given, experiment, output)
     warn_uncompiled("a simulation takes up to 34 times as long")
-    spread, field = parse_spread(given["start_values"]), read_field(given)
     if experiment is None:
-        work = _new_record(system, given, field, spread)
-    else:
-        work = _runs_again(system, experiment, given, field, spread)
-    if field is not None:
-        amplitude = {"value": field.amplitude, "unit": "1", "origin": "flag"}
-        length = {"value": field.length, "unit": "um", "origin": "default" if given["field_length"] is None else "flag"}
-        parameters = {**work.parameters, "field_amplitude": amplitude, "field_length": length}
-        work = dataclasses.replace(work, parameters=parameters)
+        slider = system.slider(True, **{name: given[name] for name in ("V", "W0", "eps")})
+        work = task.record_as_told(slider, **{name: value for name, value in given.items() if name not in NOT_TOLD})
+        told = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
+        system.say_defaults(slider.resolved, [name for name, text in told.items() if text is None])
+    else:  # srf.toml and the environment do not choose the laws of an experiment, flags do
+        laws = {name: setting.value for name, setting in system.chosen.items() if setting.origin == "flag"}
+        rest = {name: value for name, value in given.items() if name not in {*OWN_RECORD, "load_rise"}}
+        chosen: dict[str, Any] = {"laws": laws, "effects": system.effects, "parameters": system.flags}
+        work = task.runs_again(experiment, system.registry(), **chosen, **rest)
     with Progress("simulate", total=len(work.jobs)) as progress:
-        found = simulate_work(work, rtol=given["rtol"], progress=lambda name, done: progress.advance(int(done), note=name))
+        found = task.simulate_work(work, rtol=given["rtol"], progress=lambda name, done: progress.advance(int(done), note=name))
     timings, table = {"simulate": progress.seconds}, found.table
     folder, seed = given["folder"], given["seed"]
     if folder is not None and output.out is None and output.format == "text":
@@ -175,216 +171,3 @@ def _write(found: SimulationResult, folder: Path, seed: int, output: OutputOptio
     if output.provenance:
         session.detail(f"Wrote {sidecar_path(place)}")
     session.say(f"Wrote {folder} ({len(files) - 1} run{'s' if len(files) != 2 else ''})")
-
-
-def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], field: FrictionField | None, spread: float) -> Work:
-    """Return the runs of the experiment at `path`; srf.toml and the environment do not choose its laws, flags do."""
-    from srfcli.codegen.slider import check_effects
-    from srfcli.data.experiment import read_experiment
-    from srfcli.tasks.simulate import runs_again
-
-    registry = system.registry()
-    experiment = read_experiment(path, registry=registry, format=given["reader"])
-    if system.chosen["loading"].origin == "flag" and system.chosen["loading"].value != "vertical":
-        raise SrfError("the runs of an experiment are loaded from above", "Leave out --loading inclined.")
-    laws = {k: s.value for k, s in system.chosen.items() if s.origin == "flag" and k != "loading"}
-    if system.effects:
-        laws["effects"] = (*experiment.choice.effects, *_placed(system.effects))
-        check_effects(registry, laws["effects"])
-    work = runs_again(
-        experiment, registry, laws=laws,
-        parameters=system.flags, names=given["runs"], field=field, spread=spread,
-        **{key: given[key] for key in ("start", "noise", "lag1", "quantum", "seed", "folder")},
-    )  # fmt: skip
-    return dataclasses.replace(work, meta={**work.meta, "rtol": given["rtol"]})
-
-
-# A new record: drive, load and sampling from the options.
-
-LAW_FILES = (".toml", ".py")
-
-
-def _new_record(system: SystemOptions, given: Mapping[str, Any], field: FrictionField | None, spread: float) -> Work:
-    """Return the one record that the options describe; raises SrfError for what cannot be simulated or written."""
-    from srfcli.data.imposed import read_load
-    from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps
-    from srfcli.tasks import simulate as task
-
-    slider = system.slider(True, **{name: given[name] for name in ("V", "W0", "eps")})
-    values, folder = slider.resolved.values, given["folder"]
-    observables = task.check_observables([n.strip() for n in (given["observable"] or "elongation").split(",")])
-    if field is not None and system.chosen["loading"].value != "vertical":
-        raise SrfError("a random friction field is for a slider loaded from above", "Leave out --field or --loading inclined.")
-    if folder is not None and system.chosen["loading"].value != "vertical":
-        raise SrfError("an experiment folder cannot say that the spring is inclined", "Leave out --out-dir or --loading.")
-    load: Load = ConstantLoad(values["W0"])
-    begin, length = 0.0, None
-    found: tuple[str, ...] = ()
-    if given["load_file"] is not None:
-        load, times, notices = read_load(given["load_file"], registry=system.registry(), format=given["reader"])
-        begin, length, found = float(times[0]), float(times[-1] - times[0]), tuple(map(str, notices))
-    elif given["load"] is not None:
-        steps = parse_pieces(given["load"], "N", option="--load", example="2:5, 0.2:5->7, 4:7")
-        load = LoadSteps.sequence(steps, rise=parse_quantity(given["load_rise"], "s", name="--load-rise"))
-        length = load.edges[-1]
-    pieces = _drive_pieces(given, values["V"], length)
-    durations = [duration for duration, _, _ in pieces]
-    f = values["f"] if values["eps"] else None
-    if given["rate"] is None:
-        rates = (task.usual_rate(sum(durations), f),) * len(pieces)
-    else:
-        rates = parse_rates(given["rate"], len(pieces))
-    work = task.record_of(
-        slider,
-        t=task.sample_times(durations, rates, begin),
-        drive=Drive.sequence(pieces, start=begin),
-        load=load,
-        onset=None if given["onset"] is None else parse_quantity(given["onset"], "s", name="--onset"),
-        start=given["start"],
-        observables=observables,
-        on=None if field is None else (system.model(tables=task.FIELD_TABLE), field),
-    )
-    gauges = task.read_gauges(observables, **{key: given[key] for key in ("noise", "lag1", "quantum", "seed")})
-    choice, made = _laws(system), None
-    if folder is not None:
-        made = task.new_experiment(slider, choice, folder, free=given["free"], spread=spread, seed=given["seed"])
-    files = [name for name in (choice.law, choice.ageing, choice.interface, *choice.effects) if name.endswith(LAW_FILES)]
-    program = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
-    system.say_defaults(slider.resolved, [name for name, text in program.items() if text is None])
-    loaded = None if given["load"] is None else length
-    modulation, described = work.jobs[0].modulation, slider.described()
-    for name, text in program.items():
-        if text is not None:
-            described[name] = {"value": str(text), "unit": "s:um/s" if name == "V" else "s:N", "origin": "flag"}
-    return dataclasses.replace(
-        work,
-        parameters=described,
-        gauges=gauges,
-        experiment=made,
-        remarks=tuple(f"the experiment names the file {name}" for name in files),
-        inputs=() if given["load_file"] is None else (given["load_file"],),
-        notes=(*found, *work.notes, *_sampling_notes(rates, f, loaded, sum(durations))),
-        meta={"rate_Hz": sorted(set(rates)), "rtol": given["rtol"], "onset": modulation and modulation[2], **work.meta},
-    )
-
-
-def _drive_pieces(given: Mapping[str, Any], V: float, length: float | None) -> tuple[Piece, ...]:
-    """Return the pieces of --drive, or one of constant velocity: as long as --for, the load's `length` (s), or 40 um."""
-    from srfcli.tasks.simulate import LARGEST_VELOCITY
-
-    if given["drive"] is not None:
-        pieces = parse_pieces(given["drive"], "um/s", option="--drive", example="0.5:12, 4:8")
-        for number, (_, first, last) in enumerate(pieces, 1):
-            fastest = max(first, last, key=abs)
-            if abs(fastest) > LARGEST_VELOCITY:
-                raise SrfError(f"--drive: piece {number} drives at {fastest:g} um/s", f"Stay within {LARGEST_VELOCITY:g} um/s.")
-        return pieces
-    if given["duration"] is not None:
-        length = parse_quantity(given["duration"], "s", name="--for")
-        if not 0 < length <= LONGEST_TIME:
-            raise SrfError(f"--for {length:g} s is not a length of time", "Write --for 4.")
-    return ((float(f"{TRAVEL / V:.3g}") if length is None else length, V, V),)
-
-
-def _sampling_notes(rates: Sequence[float], f: float | None, loaded: float | None, driven: float) -> tuple[str, ...]:
-    """Return notes on a modulation that is sampled coarsely, and a --load that does not last (s) as long as the drive."""
-    notes = []
-    if f and min(rates) < 8 * f:
-        notes.append(
-            f"sampled {min(rates) / f:.2g} times a period of the modulation: from fewer than 8 the load is not read back"
-        )
-    if loaded is not None and loaded < driven * (1 - 1e-9):
-        notes.append(f"--load ends at {loaded:g} s of {driven:g} s; its last value holds on")
-    elif loaded is not None and loaded > driven * (1 + 1e-9):
-        notes.append(f"--load goes on to {loaded:g} s, the drive ends at {driven:g} s; the rest is not simulated")
-    return tuple(notes)
-
-
-def _laws(system: SystemOptions) -> ModelChoice:
-    """Return the laws by name, a file by its whole path: one relative to here means nothing in an experiment's folder."""
-    from srfcli.data.values import ModelChoice
-
-    names = {key: setting.value for key, setting in system.chosen.items() if key != "loading"}
-    names |= dict(zip(LAW_CHOICES, _placed([names[key] for key in LAW_CHOICES]), strict=True))
-    return ModelChoice(**names, effects=_placed(system.effects))
-
-
-def _placed(names: Sequence[str]) -> tuple[str, ...]:
-    """Return names of laws, a file's as its whole path."""
-    return tuple(str(Path(name).resolve()) if name.endswith(LAW_FILES) else name for name in names)
-
-
-# Reading of options: pieces of drive and load, sampling rates, start values, the random friction field.
-
-TRAVEL = 40.0  # um of driving where no duration is given
-LONGEST_TIME = 1e12  # s
-FIELD_LENGTH = 10.0  # um, the correlation length where only a size is given
-
-Piece = tuple[float, float, float]  # duration (s), and the values between which a quantity runs straight
-
-
-def parse_pieces(text: str, unit: str, *, option: str, example: str) -> tuple[Piece, ...]:
-    """Return the pieces of '0.5:12, 4:8' or '1:5->7', values in `unit` unless one is written.
-
-    Raises SrfError that names the option and the piece.
-    """
-    parts = [part.strip() for part in text.split(",")]
-    if not any(parts):
-        raise SrfError(f"{option} is empty", f"Write {option} '{example}'.")
-    pieces = []
-    for number, part in enumerate(parts, 1):
-        where = f"{option}: piece {number}, {part!r},"
-        duration_text, _, values_text = part.partition(":")
-        ends = [end.strip() for end in values_text.split("->")]
-        if part.count(":") != 1 or not duration_text.strip() or not all(ends) or len(ends) > 2:
-            hint = f"Write pieces with commas between them: {option} '{example}'."
-            raise SrfError(f"{where} is not DURATION:VALUE or DURATION:FROM->TO", hint)
-        duration = parse_quantity(duration_text, "s", name=f"{option}: the duration of piece {number}")
-        if not 0 < duration <= LONGEST_TIME:
-            raise SrfError(f"{where} lasts {duration:g} s", f"Give each piece a duration above 0, up to {LONGEST_TIME:g} s.")
-        split = [split_quantity(end, name=f"{option}: the value of piece {number}", example=f"5 {unit}") for end in ends]
-        written = next((u for _, u in reversed(split) if u), unit)
-        values = [convert(v, u or written, unit, name=f"{option}: piece {number}") for v, u in split]
-        pieces.append((duration, values[0], values[-1]))
-    return tuple(pieces)
-
-
-def parse_rates(text: str, pieces: int) -> tuple[float, ...]:
-    """Return the samples per second in each of so many pieces: one for all, or one for each."""
-    rates = tuple(parse_quantity(part, "Hz", name="--rate") for part in text.split(","))
-    if not all(0 < rate <= 1e9 for rate in rates):
-        raise SrfError(f"--rate {text}: a rate lies between 0 and 1e9 Hz", "Write --rate 1000.")
-    if len(rates) not in (1, pieces):
-        raise SrfError(
-            f"--rate {text} gives {len(rates)} rates for {pieces} piece{'s' if pieces != 1 else ''} of the drive",
-            "Give one rate, or one for each piece: --rate 100,1,1000.",
-        )
-    return rates * pieces if len(rates) == 1 else rates
-
-
-def parse_spread(text: str) -> float:
-    """Return by how much, relatively, written start values may be off: 0 for 'true', 0.1 for 'perturb:10%'."""
-    if text == "true":
-        return 0.0
-    kind, colon, size = text.partition(":")
-    if kind != "perturb" or not colon:
-        raise SrfError(f"--start-values {text!r} is neither true nor perturb:SIZE", "Write --start-values perturb:10%.")
-    share = size.strip().removesuffix("%")
-    spread = parse_quantity(share, "1", name="--start-values perturb") / (100.0 if share != size.strip() else 1.0)
-    if not 0 <= spread < 1:
-        raise SrfError(f"--start-values {text}: the size is not between 0 and 100 %", "Write perturb:10%.")
-    return spread
-
-
-def read_field(given: Mapping[str, Any]) -> FrictionField | None:
-    """Return the random field that --field, --field-length and --seed describe; None without one."""
-    if given["field"] is None:
-        if given["field_length"] is not None:
-            raise SrfError("--field-length is given without a field", "Give the size: --field 3e-4.")
-        return None
-    from srfcli.data.noise import FrictionField
-
-    size = parse_quantity(given["field"], "1", name="--field")
-    length = parse_quantity(given["field_length"] or str(FIELD_LENGTH), "um", name="--field-length")
-    field = FrictionField(size, length, given["seed"])
-    return field if field.amplitude else None

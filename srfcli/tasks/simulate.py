@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from srfcli.codegen.model import Array, GeneratedModel, open_model
-from srfcli.codegen.slider import SlidingSystem, declared
+from srfcli.codegen.slider import Opener, SlidingSystem, check_effects, declared
 from srfcli.codegen.splines import appended
 from srfcli.core.errors import SrfError, Status, as_pairs, did_you_mean, explained, worst
 from srfcli.core.settings import Parameter, check_value, require_parameter
-from srfcli.core.units import find_unit, from_base, parse_quantity, split_quantity, tidy, to_base
+from srfcli.core.units import convert, find_unit, from_base, parse_quantity, split_quantity, tidy, to_base
 from srfcli.data.description import MOST_OBSERVABLES
+from srfcli.data.experiment import read_experiment
+from srfcli.data.imposed import read_load
 from srfcli.data.noise import FrictionField, check_gauge, generator
 from srfcli.data.values import BOUND_FACTOR, OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
 from srfcli.data.writing import stiffness_text
@@ -348,6 +350,200 @@ def perturbed(parameters: Sequence[FitParameter], spread: float, seed: int) -> t
     return tuple(moved)
 
 
+# A new record as it is told: programs of drive and load, sampling, gauges and the random friction field as text.
+
+LAW_FILES = (".toml", ".py")
+TRAVEL = 40.0  # um of driving where no duration is given
+LONGEST_TIME = 1e12  # s
+FIELD_LENGTH = 10.0  # um, the correlation length where only a size is given
+
+Piece = tuple[float, float, float]  # duration (s), and the values between which a quantity runs straight
+
+
+def record_as_told(
+    system: SlidingSystem,
+    *,
+    drive: str | None = None,
+    load: str | None = None,
+    load_rise: str = f"{STEP_RISE:g} s",
+    load_file: Path | None = None,
+    reader: str | None = None,
+    duration: str | None = None,
+    rate: str | None = None,
+    onset: str | None = None,
+    start: str = "steady",
+    observable: str | None = None,
+    noise: str | None = None,
+    lag1: float = 0.0,
+    quantum: str | None = None,
+    field: str | None = None,
+    field_length: str | None = None,
+    seed: int = 0,
+    folder: Path | None = None,
+    free: str | None = None,
+    start_values: str = "true",
+    rtol: float = 1e-8,
+) -> Work:
+    """Return one record of a slider, to be simulated, as the options of `srf simulate` tell it.
+
+    Raises SrfError for what cannot be simulated, or written to `folder` as an experiment.
+    """
+    values, opener = system.resolved.values, system.opener
+    spread, track = read_spread(start_values), read_field(field, field_length, seed)
+    observables = check_observables([name.strip() for name in (observable or "elongation").split(",")])
+    if opener.names["loading"] != "vertical":
+        if track is not None:
+            raise SrfError("a friction field is for a slider loaded from above", "Leave out `field` or `loading` inclined.")
+        if folder is not None:
+            raise SrfError("an experiment folder cannot say that the spring is inclined", "Leave out `folder` or `loading`.")
+    imposed: Load = ConstantLoad(values["W0"])
+    begin, length, notes = 0.0, None, list[str]()
+    if load_file is not None:
+        imposed, times, notices = read_load(load_file, registry=opener.registry, format=reader)
+        begin, length, notes = float(times[0]), float(times[-1] - times[0]), list(map(str, notices))
+    elif load is not None:
+        steps = read_pieces(load, "N", name="load", example="2:5, 0.2:5->7, 4:7")
+        imposed = LoadSteps.sequence(steps, rise=parse_quantity(load_rise, "s", name="`load_rise`"))
+        length = imposed.edges[-1]
+    pieces = _drive_pieces(drive, duration, values["V"], length)
+    durations = [piece[0] for piece in pieces]
+    f, whole = values["f"] if values["eps"] else None, sum(durations)
+    rates = (usual_rate(whole, f),) * len(pieces) if rate is None else read_rates(rate, len(pieces))
+    on = None
+    if track is not None:
+        on = open_model(opener.registry, **opener.names, effects=opener.effects, tables=FIELD_TABLE), track[0]
+    work = record_of(
+        system,
+        t=sample_times(durations, rates, begin),
+        drive=Drive.sequence(pieces, start=begin),
+        load=imposed,
+        onset=None if onset is None else parse_quantity(onset, "s", name="`onset`"),
+        start=start,
+        observables=observables,
+        on=on,
+    )
+    choice, described, modulation = _choice(opener), system.described(), work.jobs[0].modulation
+    for name, text, unit in (("V", drive, "s:um/s"), ("W0", load or load_file, "s:N")):
+        if text is not None:
+            described[name] = {"value": str(text), "unit": unit, "origin": "flag"}
+    files = [name for name in (choice.law, choice.ageing, choice.interface, *choice.effects) if name.endswith(LAW_FILES)]
+    return replace(
+        work,
+        parameters=described | (track[1] if track else {}),
+        gauges=read_gauges(observables, noise=noise, lag1=lag1, quantum=quantum, seed=seed),
+        experiment=None if folder is None else new_experiment(system, choice, folder, free=free, spread=spread, seed=seed),
+        remarks=tuple(f"the experiment names the file {name}" for name in files),
+        inputs=() if load_file is None else (load_file,),
+        notes=(*notes, *work.notes, *_sampling_notes(rates, f, None if load is None else length, whole)),
+        meta={"rate_Hz": sorted(set(rates)), "rtol": rtol, "onset": modulation and modulation[2], **work.meta},
+    )
+
+
+def _choice(opener: Opener) -> ModelChoice:
+    """Return the laws by name, a file by its whole path: one relative to here means nothing in an experiment's folder."""
+    law, ageing, interface = _placed([opener.names[key] for key in ("law", "ageing", "interface")])
+    return ModelChoice(law, ageing, interface, opener.names["inertia"], _placed(opener.effects))
+
+
+def _placed(names: Sequence[str]) -> tuple[str, ...]:
+    """Return names of laws, a file's as its whole path."""
+    return tuple(str(Path(name).resolve()) if name.endswith(LAW_FILES) else name for name in names)
+
+
+def _drive_pieces(drive: str | None, duration: str | None, V: float, length: float | None) -> tuple[Piece, ...]:
+    """Return the pieces of a drive, or one of constant V: as long as `duration`, the load's `length` (s), or 40 um."""
+    if drive is not None:
+        pieces = read_pieces(drive, "um/s", name="drive", example="0.5:12, 4:8")
+        for number, (_, first, last) in enumerate(pieces, 1):
+            fastest = max(first, last, key=abs)
+            if abs(fastest) > LARGEST_VELOCITY:
+                raise SrfError(f"`drive`: piece {number} drives at {fastest:g} um/s", f"Stay within {LARGEST_VELOCITY:g} um/s.")
+        return pieces
+    if duration is not None:
+        length = parse_quantity(duration, "s", name="`duration`")
+        if not 0 < length <= LONGEST_TIME:
+            raise SrfError(f"`duration` {length:g} s is not a length of time", "Write `duration` 4.")
+    return ((float(f"{TRAVEL / V:.3g}") if length is None else length, V, V),)
+
+
+def _sampling_notes(rates: Sequence[float], f: float | None, loaded: float | None, driven: float) -> Iterator[str]:
+    """Yield notes on a modulation that is sampled coarsely, and a load that does not last (s) as long as the drive."""
+    if f and min(rates) < 8 * f:
+        yield f"sampled {min(rates) / f:.2g} times a period of the modulation: from fewer than 8 the load is not read back"
+    if loaded is not None and loaded < driven * (1 - 1e-9):
+        yield f"--load ends at {loaded:g} s of {driven:g} s; its last value holds on"
+    elif loaded is not None and loaded > driven * (1 + 1e-9):
+        yield f"--load goes on to {loaded:g} s, the drive ends at {driven:g} s; the rest is not simulated"
+
+
+def read_pieces(text: str, unit: str, *, name: str, example: str) -> tuple[Piece, ...]:
+    """Return the pieces of '0.5:12, 4:8' or '1:5->7', values in `unit` unless one is written.
+
+    Raises SrfError that names the argument and the piece.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if not any(parts):
+        raise SrfError(f"`{name}` is empty", f"Write `{name}` '{example}'.")
+    pieces = []
+    for number, part in enumerate(parts, 1):
+        where = f"`{name}`: piece {number}, {part!r},"
+        duration_text, _, values_text = part.partition(":")
+        ends = [end.strip() for end in values_text.split("->")]
+        if part.count(":") != 1 or not duration_text.strip() or not all(ends) or len(ends) > 2:
+            hint = f"Write pieces with commas between them: `{name}` '{example}'."
+            raise SrfError(f"{where} is not DURATION:VALUE or DURATION:FROM->TO", hint)
+        duration = parse_quantity(duration_text, "s", name=f"`{name}`: the duration of piece {number}")
+        if not 0 < duration <= LONGEST_TIME:
+            raise SrfError(f"{where} lasts {duration:g} s", f"Give each piece a duration above 0, up to {LONGEST_TIME:g} s.")
+        split = [split_quantity(end, name=f"`{name}`: the value of piece {number}", example=f"5 {unit}") for end in ends]
+        written = next((u for _, u in reversed(split) if u), unit)
+        values = [convert(v, u or written, unit, name=f"`{name}`: piece {number}") for v, u in split]
+        pieces.append((duration, values[0], values[-1]))
+    return tuple(pieces)
+
+
+def read_rates(text: str, pieces: int) -> tuple[float, ...]:
+    """Return the samples per second in each of so many pieces: one for all, or one for each."""
+    rates = tuple(parse_quantity(part, "Hz", name="`rate`") for part in text.split(","))
+    if not all(0 < rate <= 1e9 for rate in rates):
+        raise SrfError(f"`rate` {text}: a rate lies between 0 and 1e9 Hz", "Write `rate` 1000.")
+    if len(rates) not in (1, pieces):
+        raise SrfError(
+            f"`rate` {text} gives {len(rates)} rates for {pieces} piece{'s' if pieces != 1 else ''} of the drive",
+            "Give one rate, or one for each piece: `rate` 100,1,1000.",
+        )
+    return rates * pieces if len(rates) == 1 else rates
+
+
+def read_spread(text: str) -> float:
+    """Return by how much, relatively, written start values may be off: 0 for 'true', 0.1 for 'perturb:10%'."""
+    if text == "true":
+        return 0.0
+    kind, colon, size = text.partition(":")
+    if kind != "perturb" or not colon:
+        raise SrfError(f"`start_values` {text!r} is neither true nor perturb:SIZE", "Write `start_values` perturb:10%.")
+    share = size.strip().removesuffix("%")
+    spread = parse_quantity(share, "1", name="`start_values` perturb") / (100.0 if share != size.strip() else 1.0)
+    if not 0 <= spread < 1:
+        raise SrfError(f"`start_values` {text}: the size is not between 0 and 100 %", "Write perturb:10%.")
+    return spread
+
+
+def read_field(size: str | None, length: str | None, seed: int) -> tuple[FrictionField, dict[str, dict[str, Any]]] | None:
+    """Return the random field of a size and a length, and both as {value, unit, origin}; None without one."""
+    if size is None:
+        if length is not None:
+            raise SrfError("`field_length` is given without a field", "Give the size: `field` 3e-4.")
+        return None
+    amplitude = parse_quantity(size, "1", name="`field`")
+    field = FrictionField(amplitude, parse_quantity(length or str(FIELD_LENGTH), "um", name="`field_length`"), seed)
+    described = {
+        "field_amplitude": {"value": field.amplitude, "unit": "1", "origin": "flag"},
+        "field_length": {"value": field.length, "unit": "um", "origin": "default" if length is None else "flag"},
+    }
+    return (field, described) if field.amplitude else None
+
+
 # How a new record is sampled, where no times are given.
 
 MOST_SAMPLES = 10_000_000
@@ -405,53 +601,62 @@ OF_THE_APPARATUS = ("K", "M")
 
 
 def runs_again(
-    experiment: Experiment,
+    source: Path,
     registry: Registry,
     *,
     laws: Mapping[str, Any],
+    effects: Sequence[str] = (),
     parameters: Mapping[str, str],
-    names: Sequence[str] = (),
+    runs: Sequence[str] = (),
+    reader: str | None = None,
     start: str = "steady",
     noise: str | None = None,
     lag1: float = 0.0,
     quantum: str | None = None,
+    field: str | None = None,
+    field_length: str | None = None,
     seed: int = 0,
-    field: FrictionField | None = None,
     folder: Path | None = None,
-    spread: float = 0.0,
+    start_values: str = "true",
+    rtol: float = 1e-8,
 ) -> Work:
-    """Return the runs of an experiment, to be simulated with its own laws and values but for those given.
+    """Return the runs of the experiment at `source`, to be simulated with its own laws and values but for those given.
 
-    `laws` are fields of its ModelChoice, `parameters` values as text; `names` are those of the runs, all if left out. `start` is
-    as in `simulate`, the gauges are as in `read_gauges`; `field` is what the runs slide on. `folder` is where the records are
-    written as an experiment, if they are, and `spread` by how much its start values are off.
+    `laws` are fields of its ModelChoice, `effects` are added to its own, `parameters` are values as text; `runs` are names of
+    runs, all if left out. What else is given is as in `record_as_told`.
     """
+    spread, track = read_spread(start_values), read_field(field, field_length, seed)
+    experiment = read_experiment(source, registry=registry, format=reader)
+    if laws.get("loading", "vertical") != "vertical":
+        raise SrfError("the runs of an experiment are loaded from above", "Leave out `loading` inclined.")
     experiment.check_recorded("to simulate")
-    choice = replace(experiment.choice, **laws)
+    choice = replace(experiment.choice, **{k: v for k, v in laws.items() if k != "loading"}).plus(_placed(effects))
+    if effects:
+        check_effects(registry, choice.effects)
     model = open_model(registry, **asdict(choice), stability=False)
     values = _values(model, parameters, stress=experiment.stress)
-    runs = experiment.named(names)
-    observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in runs))
+    chosen = experiment.named(runs)
+    observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in chosen))
     if len(observables) > 1 and (noise or quantum):
         raise SrfError(
             f"the runs record {' and '.join(map(', '.join, sorted(observables)))}: one `noise` has no unit for all",
             "Choose runs that record the same, with `runs`.",
         )
     gauges = read_gauges(observables[0], noise=noise, lag1=lag1, quantum=quantum, seed=seed)
-    jobs = tuple(_job(model, experiment, run, values, start) for run in runs)
-    unknown = [run.name for run in runs if run.initial == "free"]
+    jobs = tuple(_job(model, experiment, run, values, start) for run in chosen)
+    unknown = [run.name for run in chosen if run.initial == "free"]
     begun = f"initial state of {', '.join(unknown)} not known: begun in steady sliding" if unknown else None
     scaled = None if "K" in values else experiment.rescaled()
     notes = tuple(note for note in (begun, scaled) if note)
-    inputs = (experiment.path, *(run.file for run in runs))
+    inputs = (experiment.path, *(run.file for run in chosen))
     made = None if folder is None else _experiment_again(experiment, model, choice, values, folder, spread, seed)
     dropped = [p.name for p in experiment.parameters if p.name not in model.names]
     remarks = (f"not written, as {choice.law} has no such parameter: {', '.join(dropped)}",) if dropped else ()
-    described = _described(model, experiment, values)
+    described = _described(model, experiment, values) | (track[1] if track else {})
     work = Work(model, jobs, described, gauges, made, remarks, inputs, notes, {"title": experiment.title})
-    if field is None:
-        return work
-    return on_field(work, open_model(registry, **asdict(choice), tables=FIELD_TABLE), field, start=start)
+    if track is not None:
+        work = on_field(work, open_model(registry, **asdict(choice), tables=FIELD_TABLE), track[0], start=start)
+    return replace(work, meta={**work.meta, "rtol": rtol})
 
 
 def _values(model: GeneratedModel, parameters: Mapping[str, str], *, stress: bool) -> dict[str, float]:
