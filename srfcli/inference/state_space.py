@@ -608,9 +608,9 @@ class Likelihood:
         def one(run: Run) -> Filtered:
             nonlocal failed  # then the others are not needed
             own = x[[self.names.index(n) for n in self._dependences(run)]]
-            last, known = self._last.get(run.name, (None, None))
-            if known is not None and not keep and (known.names or not slopes) and np.array_equal(own, last):
-                return known  # of what varies by group most runs do not depend
+            last = self._last.get(run.name)
+            if last is not None and not keep and (last[1].names or not slopes) and np.array_equal(own, last[0]):
+                return last[1]  # of what varies by group most runs do not depend
             found = self.filtered(run, values, slopes=slopes, keep=keep, most=0 if failed else most.get(run.name))
             failed = failed or not found.whole
             if found.whole:
