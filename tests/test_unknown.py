@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from commands import srf
 
 from srfcli.cli.main import cli
 from srfcli.codegen.model import open_model
@@ -80,6 +81,19 @@ def age(tmp_path_factory, without_figures):
     arguments = ["diagnose", str(recorded(folder, replace(Physics(), p_age=1.7))), "--effect", "sensor-lag"]
     result = CliRunner().invoke(cli, [*arguments, "--out", str(out), "--json"])
     assert result.exit_code == 0, result.output
+    return out
+
+
+@pytest.fixture(scope="module")
+def unsteady(tmp_path_factory):
+    """A recording that begins in no steady sliding, which is not stated: no effect says so, and its search is short."""
+    out = tmp_path_factory.mktemp("unsteady") / "made"
+    slider = "--law dieterich-ruina --interface rigid --no-inertia --W0 10 --set mu0=0.6 --set A=0.008 --set B=0.011 --set D0=5"
+    gauge = "--drive 20:4,15:12,20:4 --rate 10 --observe force --noise 0.003 --free mu0,A,B,D0 --seed 1"
+    srf("simulate", *slider.split(), *gauge.split(), "--K", "0.1 N/um", "--start", "phi=0.3 s", "--out-dir", out)
+    text = (out / "experiment.toml").read_text()
+    assert 'initial = "free"\n' in text
+    (out / "experiment.toml").write_text(text.replace('initial = "free"\n', ""))
     return out
 
 
@@ -203,14 +217,14 @@ def test_the_form_is_offered_as_an_effect(age):
         pytest.param(RuntimeError, 0, "RuntimeError: no", marks=pytest.mark.slow),
     ],
 )
-def test_a_verdict_outlives_its_explanation(age, tmp_path, srf_ended_at, without_figures, end, code, said):
+def test_a_verdict_outlives_its_explanation(unsteady, tmp_path, srf_ended_at, without_figures, end, code, said):
     """Where the search for a closed form is interrupted, or fails, verdict and missing force are written all the same."""
-    arguments, out = ("diagnose", age.parent, "--effect", "sensor-lag"), tmp_path / "found"
+    arguments, out = ("diagnose", unsteady, "--effect", "second-state"), tmp_path / "found"
     found, printed, _ = srf_ended_at("unknown: what is missing", *arguments, "--out", out, end=end("no"))
     assert found == code and "unknown" in printed and said in " ".join(printed.split())
     found = json.loads((out / "answer.json").read_text())
     assert found["verdict"] == "unknown" and not found["missing"]["searched"] and found["missing"]["form"] is None
-    assert (out / "missing-steps.csv").exists()
+    assert (out / "missing-simulated.csv").exists()
 
 
 def test_terms_together_are_one_effect(tmp_path):
