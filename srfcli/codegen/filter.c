@@ -3,9 +3,11 @@
    Compiled behind radau.c and dual.c, for all models of NX states. A model has where the field's white noise enters the rates, and
    that, its rates, its gauge and the spring as it is, without the gauge's own lag, in dual numbers.
    The mean follows Radau IIA; the covariance follows the exact derivative of each of its steps, P -> Phi P Phi' + sum c c', where
-   c are the responses to the MODES lowest Legendre polynomials of the white noise over the step. Everything is carried along in
-   dual numbers, so that innovations and their variances have the derivatives of what was computed.
-   Jazwinski, Stochastic Processes and Filtering Theory, 1970; Griewank and Walther, Evaluating Derivatives, 2008. */
+   c are the responses to the MODES lowest Legendre polynomials of the white noise over the step. Where a reading moves the state so
+   far that the equations are not linear, they are linearised again about the state before, as that reading corrects it (iterated
+   linear filter-smoother). Everything is carried along in dual numbers, so that innovations and their variances have the derivatives
+   of what was computed. Jazwinski, Stochastic Processes and Filtering Theory, 1970, chapter 8; Wishner, Tabaczynski and Athans,
+   Automatica 5 (1969); Griewank and Walther, Evaluating Derivatives, 2008. */
 
 MODEL void srf_gain(const double *x, double V, double W, double W_dot, const double *p, double *out); /* (NX) */
 MODEL void srf_d_rates(const dual *x, double V, double W, double W_dot, const dual *p, dual *out);
@@ -24,16 +26,18 @@ typedef double quad __attribute__((vector_size(32), may_alias)); /* wider vector
 #define SPRING -2
 #define NO_VARIANCE 1e150                   /* a variance that is none any more */
 #define MANY 1000                           /* steps between two readings, after which their pace is looked at */
+#define RELINEARISATIONS 8                  /* between two readings, at most */
 
 typedef struct {
     double x[NA], P[NA * NA], T[NA * NA];   /* mean and covariance of state and gauge noise; transition since the last sample */
-    lanes xd[NA], Pd[NA * NA];
+    lanes xd[NA], Pd[NA * NA], Td[NA * NA];
 } Belief;
 
 typedef struct {
     const double *p;
     const dual *q;
     int slopes, keep, ng, na;               /* processes of gauge noise, of all signals; states with theirs */
+    int mean_only, tangents;                /* the mean alone is moved; the transition's derivatives are taken */
     const int *order;                       /* how many states each of these has */
     double rtol, longest, h;                /* h: the step that the last one suggests */
     const double *atol;
@@ -111,6 +115,10 @@ static void move_mean(const Course *course, Belief *b, const double *Z, const do
    over what is allowed, by the share that the last polynomial has in the variances; nothing is changed unless it is below 1. */
 static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double t, double h, const double *Z) {
     int na = course->na;
+    if (course->mean_only) {
+        for (int r = 0; r < NX; r++) b->x[r] += Z[2 * NX + r];
+        return 0.0;
+    }
     double J[3][NX * NX], V[3], W[3], W_dot[3], x[3][NX], gain[3 * NX];
     double G[NZ * (NC + LANES)] __attribute__((aligned(64))), B[NZ * (NC + LANES)] __attribute__((aligned(64)));
     dual y[NX], f[NX];
@@ -199,7 +207,7 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
                 }
     }
     double M[NX * NA], P[NX * NX];
-    lanes dM[NX * NA];
+    lanes dM[NX * NA], dT[NX * NA];
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < na; c++) {
             double sum = 0.0, through = 0.0;
@@ -213,6 +221,14 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
             for (int k = 0; k < NX; k++) {
                 for (int c = 0; c < na; c++) add_scaled(LANES, b->P[k * na + c], dPhi + r * NC + k, dM + r * na + c);
                 add_scaled(na * LANES, Phi[r * NC + k], b->Pd + k * na, dM + r * na);
+            }
+    }
+    if (course->tangents) {
+        memset(dT, 0, sizeof dT);
+        for (int r = 0; r < NX; r++)
+            for (int k = 0; k < NX; k++) {
+                for (int c = 0; c < na; c++) add_scaled(LANES, b->T[k * na + c], dPhi + r * NC + k, dT + r * na + c);
+                add_scaled(na * LANES, Phi[r * NC + k], b->Td + k * na, dT + r * na);
             }
     }
     for (int r = 0; r < NX; r++)
@@ -232,6 +248,7 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
     if (!(error < 1.0)) return error;
     move_mean(course, b, Z, B, m, NC);
     for (int r = 0; r < NX; r++) memcpy(b->T + r * na, G + r * na, na * sizeof(double));
+    if (course->tangents) memcpy(b->Td, dT, (size_t)NX * na * sizeof(lanes));
     for (int r = 0; r < NX; r++) {
         for (int c = NX; c < na; c++) {
             b->P[r * na + c] = b->P[c * na + r] = M[r * na + c];
@@ -363,8 +380,10 @@ static void age_gauge(Course *course, Belief *b, double dt, const dual *gauge) {
         for (int c = 0; c < na; c++) gauge_turn(w, F, b->P + at * na + c, b->Pd + at * na + c, na);
         for (int c = 0; c < na; c++) gauge_turn(w, F, b->P + c * na + at, b->Pd + c * na + at, 1);
         for (int c = 0; c < na; c++) {
-            double old[2] = {b->T[at * na + c], w == 2 ? b->T[(at + 1) * na + c] : 0.0};
-            for (int r = 0; r < w; r++) b->T[(at + r) * na + c] = F[r * w].v * old[0] + (w == 2 ? F[r * w + 1].v * old[1] : 0.0);
+            double *T = b->T + at * na + c, old[2] = {T[0], w == 2 ? T[na] : 0.0};
+            if (course->tangents) gauge_turn(w, F, T, b->Td + at * na + c, na);
+            else
+                for (int r = 0; r < w; r++) T[r * na] = F[r * w].v * old[0] + (w == 2 ? F[r * w + 1].v * old[1] : 0.0);
         }
         for (int r = 0; r < w; r++)
             for (int c = 0; c < w; c++) {
@@ -399,6 +418,299 @@ static void fresh_gauge(Course *course, Belief *b, const dual *gauge) {
     }
 }
 
+/* all that is given of one run, as `srf_filter` has it */
+typedef struct {
+    int n_segments;
+    const double *edges, *drive, *longest;
+    const int *range;
+    const double *t, *observed, *weighs, *factor, *offset, *R, *gauge;
+    const int *rate, *signal, *shows;
+    const unsigned char *used;
+    const int *logarithm;
+    const double *linear;
+    int weighed, begins[NA];                /* 1 + the signal of the process whose first state this is, else 0 */
+    double *values;
+    dual *q;
+} Recording;
+
+/* where a run stands: what is imposed, and how the integration goes on */
+typedef struct {
+    Imposed force;
+    Control control;
+    double h, longest, now;
+    int segment;
+} Place;
+
+/* what is expected of a reading: `there` at the state about which it is linearised, which is the mean unless
+   that state was shifted; its gradient H (na), the covariance with it PH, innovation and variance; by how much the tangent leads
+   back (NX) from the shifted state to the mean */
+typedef struct {
+    dual there, noise, shifted[NX];
+    double H[NA], PH[NA], miss, variance;
+    lanes dH[NA], dPH[NA], dmiss, dvariance;
+} Expected;
+
+static const size_t wide = 1 + LANES;
+#define TAKE(to, from) ((to).v = *(from), memcpy(&(to).d, (from) + 1, sizeof(lanes)))
+
+static Place place(const Course *course, Place at) {
+    at.control = course->control;
+    at.h = course->h;
+    at.longest = course->longest;
+    return at;
+}
+
+static void resume(Course *course, const Place *from, Place *at) {
+    *at = *from;
+    course->control = from->control;
+    course->h = from->h;
+    course->longest = from->longest;
+}
+
+static void copy_belief(const Course *course, const Belief *from, Belief *to) {
+    const size_t na = course->na;
+    memcpy(to->x, from->x, na * sizeof(double));
+    memcpy(to->P, from->P, na * na * sizeof(double));
+    if (!course->slopes) return;
+    memcpy(to->xd, from->xd, na * sizeof(lanes));
+    memcpy(to->Pd, from->Pd, na * na * sizeof(lanes));
+}
+
+/* the transition since the last sample begins */
+static void begin_transition(const Course *course, Belief *b) {
+    const size_t na = course->na;
+    memset(b->T, 0, na * na * sizeof(double));
+    for (size_t i = 0; i < na; i++) b->T[i * na + i] = 1.0;
+    if (course->tangents) memset(b->Td, 0, na * na * sizeof(lanes));
+}
+
+/* moves a belief on to a time; returns 0 where it stops early */
+static int travel(const Recording *run, Place *at, Course *course, Belief *b, double to) {
+    while (at->now < to || at->segment < 0) {
+        int next = at->segment + 1;
+        if (at->segment < 0 || (next < run->n_segments && at->now >= run->edges[next])) {
+            at->segment = next;
+            at->force.low = at->force.at = run->range[2 * next];
+            at->force.high = run->range[2 * next + 1] - 1;
+            at->force.V = run->drive[3 * next];
+            at->force.acceleration = run->drive[3 * next + 1];
+            at->force.since = run->drive[3 * next + 2];
+            course->longest = run->longest[next];
+            course->control.before = course->control.last_h = course->h = 0.0;
+            continue;
+        }
+        double end = next < run->n_segments ? fmin(to, run->edges[next]) : to;
+        if (!advance(&at->force, course, b, at->now, end)) return 0;
+        at->now = end;
+    }
+    return 1;
+}
+
+/* moves a belief, gauge noise and all, on to a reading from the one before; returns 0 where it stops early */
+static int reach(const Recording *run, int k, Place *at, Course *course, Belief *b) {
+    dual colour[3 * GAUGE_PROCESSES * SIGNALS];
+    if (!travel(run, at, course, b, run->t[k])) return 0;
+    for (int i = 0; i < 3 * course->ng; i++) TAKE(colour[i], run->gauge + ((size_t)run->rate[k] * 3 * course->ng + i) * wide);
+    if (!k || run->rate[k] != run->rate[k - 1]) fresh_gauge(course, b, colour);
+    else if (run->t[k] > run->t[k - 1]) age_gauge(course, b, run->t[k] - run->t[k - 1], colour);
+    return 1;
+}
+
+/* what a reading shows of the states, without its factor, and the gradient g (NX) unless that is NULL */
+static dual shown(const Recording *run, int k, Place *at, const dual *y, dual *g) {
+    double V, W, W_dot;
+    dual out = srf_plain(0.0);
+    if (g) memset(g, 0, NX * sizeof *g);
+    if (run->shows[k] >= 0) {
+        if (g) g[run->shows[k]].v = 1.0;
+        return y[run->shows[k]];
+    }
+    imposed(&at->force, run->t[k], &V, &W, &W_dot);
+    if (run->shows[k] == GAUGE) {
+        srf_d_reading(y, V, W, W_dot, run->q, &out);
+        if (g) srf_d_reading_gradient(y, V, W, W_dot, run->q, g);
+        return out;
+    }
+    if (run->weighed >= 0) run->q[run->weighed].v = run->weighs[k];
+    srf_d_spring(y, V, W, W_dot, run->q, &out);
+    if (g) srf_d_spring_gradient(y, V, W, W_dot, run->q, g);
+    if (run->weighed >= 0) run->q[run->weighed].v = run->values[run->weighed];
+    return out;
+}
+
+/* what is expected of a reading under a belief whose mean was shifted by `shift` (NX) at the reading before, NULL if by nothing */
+static void expect(const Recording *run, int k, Place *at, const Course *course, const Belief *b, const dual *shift, Expected *e) {
+    const int na = course->na;
+    dual y[NX], g[NX], scale, offset, linear;
+    for (int i = 0; i < NX; i++) y[i].v = b->x[i], y[i].d = b->xd[i];
+    TAKE(scale, run->factor + k * wide);
+    TAKE(offset, run->offset + k * wide);
+    TAKE(e->noise, run->R + k * wide);
+    e->there = srf_add(srf_mul(scale, shown(run, k, at, y, g)), offset);
+    for (int i = 0; i < na; i++) {
+        int own = i >= NX && run->begins[i] == 1 + run->signal[k];
+        dual slope = i < NX ? srf_mul(scale, g[i]) : srf_plain(own);
+        e->H[i] = slope.v;
+        e->dH[i] = slope.d;
+        if (own) e->there.v += b->x[i], e->there.d += b->xd[i];
+    }
+    linear = e->there;
+    for (int i = 0; shift && i < NX; i++) {
+        e->shifted[i] = srf_plain(0.0);
+        for (int j = 0; j < NX; j++) {
+            e->shifted[i].v += b->T[i * na + j] * shift[j].v;
+            if (course->slopes) e->shifted[i].d += b->T[i * na + j] * shift[j].d + b->Td[i * na + j] * shift[j].v;
+        }
+        linear.v -= e->H[i] * e->shifted[i].v;
+        linear.d -= e->H[i] * e->shifted[i].d + e->dH[i] * e->shifted[i].v;
+    }
+    memset(e->PH, 0, sizeof e->PH);
+    memset(e->dPH, 0, sizeof e->dPH);
+    for (int i = 0; i < na; i++)
+        for (int j = 0; j < na; j++) {
+            e->PH[i] += b->P[i * na + j] * e->H[j];
+            if (!course->slopes) continue;
+            add_scaled(LANES, e->H[j], b->Pd + i * na + j, e->dPH + i);
+            add_scaled(LANES, b->P[i * na + j], e->dH + j, e->dPH + i);
+        }
+    e->miss = run->observed[k] - linear.v;
+    e->dmiss = -linear.d;
+    e->variance = e->noise.v;
+    e->dvariance = e->noise.d;
+    for (int i = 0; i < na; i++) {
+        e->variance += e->H[i] * e->PH[i];
+        e->dvariance += e->dH[i] * e->PH[i] + e->H[i] * e->dPH[i];
+    }
+}
+
+/* how a reading corrects the belief before: of the states there (NX), which is their
+   covariance times `by` (na); the reading to which the tangent then leads, and its variance for a state before that is known */
+typedef struct {
+    dual shift[NX];
+    double by[NA], ahead, variance;
+} Correction;
+
+/* the correction of the belief `from` by the tangent at `shift` (NX), from where the belief came */
+static void correct(const Course *course, const Belief *from, const Belief *b, const Expected *e, const dual *shift, Correction *c) {
+    const int na = course->na;
+    dual back[NA];
+    for (int j = 0; j < na; j++) {
+        back[j] = srf_plain(0.0);
+        for (int l = 0; l < na; l++) {
+            back[j].v += b->T[l * na + j] * e->H[l];
+            if (course->tangents) back[j].d += b->T[l * na + j] * e->dH[l] + b->Td[l * na + j] * e->H[l];
+        }
+        c->by[j] = back[j].v * e->miss / e->variance;
+    }
+    c->ahead = e->there.v;
+    c->variance = e->variance;
+    for (int i = 0; i < na; i++) {
+        dual sum = srf_plain(0.0);
+        for (int j = 0; j < na; j++) {
+            sum.v += from->P[i * na + j] * back[j].v;
+            if (course->tangents) sum.d += from->P[i * na + j] * back[j].d + from->Pd[i * na + j] * back[j].v;
+        }
+        c->variance -= back[i].v * sum.v;
+        if (i >= NX) continue;
+        double gain = sum.v / e->variance;
+        c->shift[i].v = gain * e->miss;
+        c->shift[i].d = (sum.d - gain * e->dvariance) * (e->miss / e->variance) + gain * e->dmiss;
+        c->ahead += back[i].v * (c->shift[i].v - shift[i].v);
+    }
+}
+
+/* twice what a correction takes from the log density of the states before */
+static double cost_of(const Course *course, const Belief *from, const double *by) {
+    double sum = 0.0;
+    for (int i = 0; i < course->na; i++)
+        for (int j = 0; j < course->na; j++) sum += by[i] * from->P[i * course->na + j] * by[j];
+    return sum;
+}
+
+/* whether a reading moves the states so far that where they come from by the equations is not where their tangent leads */
+static int bent(const Recording *run, int k, const Place *was, Place *at, Course *course, Belief *from, const Belief *b, const Expected *e) {
+    double farthest = 0.0, limit = run->linear[1] * sqrt(e->noise.v), read = NAN, kept[NX];
+    dual none[NX], y[NX], scale;
+    Correction c;
+    if (!(fabs(e->miss) * (e->variance - e->noise.v) > limit * e->variance)) return 0;
+    for (int i = 0; i < NX; i++)
+        if (run->logarithm[i]) farthest = fmax(farthest, fabs(e->PH[i] * e->miss / e->variance));
+    if (!(farthest > run->linear[0])) return 0;
+    const Place then = place(course, *at);
+    memset(none, 0, sizeof none);
+    correct(course, from, b, e, none, &c);
+    memcpy(kept, from->x, sizeof kept);
+    for (int i = 0; i < NX; i++) from->x[i] += c.shift[i].v;
+    resume(course, was, at);
+    course->mean_only = 1;
+    TAKE(scale, run->factor + k * wide);
+    if (travel(run, at, course, from, run->t[k])) {
+        for (int i = 0; i < NX; i++) y[i] = srf_plain(from->x[i]);
+        read = shown(run, k, at, y, NULL).v;
+        for (int i = 0; i < NX; i++) y[i] = srf_plain(b->x[i]);
+        read = e->there.v + scale.v * (read - shown(run, k, at, y, NULL).v);
+    }
+    course->mean_only = 0;
+    resume(course, &then, at);
+    memcpy(from->x, kept, sizeof kept);
+    return fabs(read - c.ahead) > limit;
+}
+
+/* A belief at a reading, linearised about the state before as the reading corrects it: again until the next correction has what
+   the tangent says of it, by half a correction where a whole one leads to what is less likely (Gauss and Newton's method). Where the
+   corrected state cannot be followed, the belief stays as it was. Returns 0 where it stops early. */
+static int relinearise(const Recording *run, int k, const Place *was, Place *at, Course *course, const Belief *from, Belief *b, Expected *e) {
+    Correction best, c;
+    dual shift[NX];
+    double by[NA], lowest = INFINITY;
+    int found = 1, halved = 0;
+    memset(shift, 0, sizeof shift);
+    memset(by, 0, sizeof by);
+    memset(&best, 0, sizeof best);
+    for (int turn = 0; turn <= RELINEARISATIONS + 1; turn++) {
+        course->tangents = course->slopes;
+        copy_belief(course, from, b);
+        begin_transition(course, b);
+        resume(course, was, at);
+        for (int i = 0; i < NX; i++) b->x[i] += shift[i].v, b->xd[i] += shift[i].d;
+        if (!(found = reach(run, k, at, course, b))) break;
+        expect(run, k, at, course, b, shift, e);
+        if (!(found = e->variance > 0.0 && e->variance < NO_VARIANCE)) break;
+        if (turn && !halved && fabs(e->there.v - c.ahead) <= run->linear[1] * sqrt(e->noise.v)) break;
+        correct(course, from, b, e, shift, &c);
+        double off = run->observed[k] - e->there.v, total = cost_of(course, from, by) + off * off / c.variance;
+        if (turn >= RELINEARISATIONS) { /* the likeliest, then */
+            if (total <= lowest || turn > RELINEARISATIONS) break;
+            memcpy(shift, best.shift, sizeof shift);
+            memcpy(by, best.by, sizeof by);
+            continue;
+        }
+        if (total > lowest) { /* towards the likeliest so far */
+            halved = 1;
+            for (int i = 0; i < NX; i++) shift[i] = srf_mul_c(srf_add(best.shift[i], shift[i]), 0.5);
+            for (int i = 0; i < NA; i++) by[i] = 0.5 * (best.by[i] + by[i]);
+            continue;
+        }
+        halved = 0;
+        lowest = total;
+        memcpy(best.shift, shift, sizeof shift);
+        memcpy(best.by, by, sizeof by);
+        memcpy(shift, c.shift, sizeof shift);
+        memcpy(by, c.by, sizeof by);
+    }
+    course->tangents = 0;
+    if (!found) {
+        copy_belief(course, from, b);
+        begin_transition(course, b);
+        resume(course, was, at);
+        if (!reach(run, k, at, course, b)) return 0;
+        expect(run, k, at, course, b, NULL, e);
+        return 1;
+    }
+    for (int i = 0; i < NX; i++) b->x[i] -= e->shifted[i].v, b->xd[i] -= e->shifted[i].d;
+    return 1;
+}
+
 /* One run: innovations nu (nt), their variances S (nt) and the derivatives of both (nt, LANES), at the readings where `used`; all
    get the mean (nt, na), covariance (nt, na, na), transition (nt, na, na) from the reading before and the reading's gradient (nt,
    na), before they are used, and how states follow it (nt, na), 0 if held, where those are wanted. Several signals may be read at
@@ -407,125 +719,62 @@ static void fresh_gauge(Course *course, Belief *b, const dual *gauge) {
    `weighs` (nt), 0 or 1, with which parameter `weighed` is replaced (-1 for none); from 0 on a state. The processes of coloured
    noise have `order` (ng) states each, belong to the signal `owner` (ng), and have parameters gauge (rates, ng, 3); which of the
    rates holds at a reading is `rate` (nt): where it changes, a noise begins that owes nothing to the one before. A reading moves
-   no state by more than `farthest` (NX). p holds dual numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too,
-   as do gauge, factor, offset, R (nt) and farthest. Returns how many readings were reached; stats: steps, rejected, readings that
-   were held to `farthest`. */
-int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, const double *farthest, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *gains, double *stats, const volatile int *stop) {
+   no state by more than `farthest` (NX). The states that are logarithms are those where `logarithm` (NX) is 1; `linear` (2) says how
+   far a reading may move them, and how much a reading over its white noise may then differ from its tangent, before the equations are
+   linearised again. p holds dual numbers
+   (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset, R (nt) and farthest. Returns how many readings were reached; stats: steps, rejected, readings that
+   were held to `farthest`, readings about which the equations were linearised again. */
+int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, const double *farthest, const int *logarithm, const double *linear, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *gains, double *stats, const volatile int *stop) {
     double values[NP];
-    dual q[NP], colour[3 * GAUGE_PROCESSES * SIGNALS], y[NX], one, g[NX], bound[NX];
-    Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values};
-    Course course = {values, q, slopes, keep, ng, NX, order, rtol, 0.0, 0.0, atol, {{0.0}, 0.0, 0.0, 0.0, 0}, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
-    Belief b;
-    int na, segment_ = -1, filled = 0, bounded = 0, begins[NA] = {0}; /* 1 + the signal of the process whose first state this is */
-    double now = t[0], last = t[0];
-    const size_t wide = 1 + LANES;
-#define TAKE(to, from) ((to).v = *(from), memcpy(&(to).d, (from) + 1, sizeof(lanes)))
-#define TAKE_COLOUR(at) for (int i_ = 0; i_ < 3 * ng; i_++) TAKE(colour[i_], gauge + ((size_t)(at) * 3 * ng + i_) * wide)
+    dual q[NP], one, bound[NX];
+    Course course = {values, q, slopes, keep, ng, NX, 0, 0, order, rtol, 0.0, 0.0, atol, {{0.0}, 0.0, 0.0, 0.0, 0}, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
+    Recording run = {n_segments, edges, drive, longest, range, t, observed, weighs, factor, offset, R, gauge, rate, signal, shows, used, logarithm, linear, weighed, {0}, values, q};
+    Place at = {{n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values}, {{0.0}, 0.0, 0.0, 0.0, 0}, 0.0, 0.0, t[0], -1};
+    Belief b, from;
+    Expected e;
+    int na, filled = 0, bounded = 0, relinearised = 0;
     memset(&b, 0, sizeof b);
     for (int i = 0; i < NP; i++) TAKE(q[i], p + i * wide), values[i] = q[i].v;
-    for (int j = 0; j < ng; j++) begins[course.na] = 1 + owner[j], course.na += order[j];
+    for (int j = 0; j < ng; j++) run.begins[course.na] = 1 + owner[j], course.na += order[j];
     na = course.na;
     for (int i = 0; i < NX; i++) TAKE(one, x0 + i * wide), b.x[i] = one.v, b.xd[i] = one.d;
     for (int i = 0; i < NX; i++) TAKE(bound[i], farthest + i * wide);
     for (int i = 0; i < NX; i++)
         for (int j = 0; j < NX; j++) TAKE(one, P0 + (i * NX + j) * wide), b.P[i * na + j] = one.v, b.Pd[i * na + j] = one.d;
-    TAKE_COLOUR(rate[0]);
-    fresh_gauge(&course, &b, colour);
-    for (int i = 0; i < na; i++) b.T[i * na + i] = 1.0;
     for (int k = 0; k < nt; k++) {
-        while (now < t[k] || segment_ < 0) {
-            if (segment_ < 0 || (segment_ + 1 < n_segments && now >= edges[segment_ + 1])) {
-                segment_++;
-                force.low = force.at = range[2 * segment_];
-                force.high = range[2 * segment_ + 1] - 1;
-                force.V = drive[3 * segment_];
-                force.acceleration = drive[3 * segment_ + 1];
-                force.since = drive[3 * segment_ + 2];
-                course.longest = longest[segment_];
-                course.control.before = course.control.last_h = course.h = 0.0;
-                continue;
-            }
-            double to = segment_ + 1 < n_segments ? fmin(t[k], edges[segment_ + 1]) : t[k];
-            if (!advance(&force, &course, &b, now, to)) goto end;
-            now = to;
+        const Place was = place(&course, at);
+        const int interval = k && used[k] && t[k] > t[k - 1];
+        if (interval) copy_belief(&course, &b, &from);
+        begin_transition(&course, &b);
+        if (!reach(&run, k, &at, &course, &b)) goto end;
+        expect(&run, k, &at, &course, &b, NULL, &e);
+        if (interval && bent(&run, k, &was, &at, &course, &from, &b, &e)) {
+            if (!relinearise(&run, k, &was, &at, &course, &from, &b, &e)) goto end;
+            relinearised++;
         }
-        if (k && rate[k] != rate[k - 1]) {
-            TAKE_COLOUR(rate[k]);
-            fresh_gauge(&course, &b, colour);
-        } else if (t[k] > last) age_gauge(&course, &b, t[k] - last, colour);
-        last = t[k];
-        double V, W, W_dot, PH[NA], H[NA];
-        lanes dPH[NA], dH[NA];
-        static const lanes none = {0.0};
-        dual reading, scale, shift, noise;
-        imposed(&force, t[k], &V, &W, &W_dot);
-        for (int i = 0; i < NX; i++) y[i].v = b.x[i], y[i].d = b.xd[i];
-        memset(g, 0, sizeof g);
-        memset(&reading, 0, sizeof reading);
-        if (shows[k] >= 0) {
-            reading = y[shows[k]];
-            g[shows[k]].v = 1.0;
-        } else if (shows[k] == SPRING) {
-            if (weighed >= 0) q[weighed].v = weighs[k];
-            srf_d_spring(y, V, W, W_dot, q, &reading);
-            srf_d_spring_gradient(y, V, W, W_dot, q, g);
-            if (weighed >= 0) q[weighed].v = values[weighed];
-        } else {
-            srf_d_reading(y, V, W, W_dot, q, &reading);
-            srf_d_reading_gradient(y, V, W, W_dot, q, g);
-        }
-        TAKE(scale, factor + k * wide);
-        TAKE(shift, offset + k * wide);
-        TAKE(noise, R + k * wide);
-        reading = srf_add(srf_mul(scale, reading), shift);
-        for (int i = 0; i < na; i++) {
-            int own = i >= NX && begins[i] == 1 + signal[k];
-            one = i < NX ? srf_mul(scale, g[i]) : srf_plain(own);
-            H[i] = one.v;
-            dH[i] = one.d;
-            if (own) reading.v += b.x[i], reading.d += b.xd[i];
-        }
-        for (int i = 0; i < na; i++) {
-            PH[i] = 0.0;
-            dPH[i] = none;
-            for (int j = 0; j < na; j++) {
-                PH[i] += b.P[i * na + j] * H[j];
-                if (!slopes) continue;
-                add_scaled(LANES, H[j], b.Pd + i * na + j, dPH + i);
-                add_scaled(LANES, b.P[i * na + j], dH + j, dPH + i);
-            }
-        }
-        double variance = noise.v, miss = observed[k] - reading.v;
-        lanes dvariance = noise.d, dmiss = -reading.d;
-        for (int i = 0; i < na; i++) {
-            variance += H[i] * PH[i];
-            dvariance += dH[i] * PH[i] + H[i] * dPH[i];
-        }
-        nu[k] = miss;
-        S[k] = variance;
-        memcpy(nu_d + (size_t)k * LANES, &dmiss, sizeof dmiss);
-        memcpy(S_d + (size_t)k * LANES, &dvariance, sizeof dvariance);
+        nu[k] = e.miss;
+        S[k] = e.variance;
+        memcpy(nu_d + (size_t)k * LANES, &e.dmiss, sizeof e.dmiss);
+        memcpy(S_d + (size_t)k * LANES, &e.dvariance, sizeof e.dvariance);
         if (keep) {
             memcpy(mean + (size_t)k * na, b.x, na * sizeof(double));
-            memcpy(gradient + (size_t)k * na, H, na * sizeof(double));
+            memcpy(gradient + (size_t)k * na, e.H, na * sizeof(double));
             memset(gains + (size_t)k * na, 0, na * sizeof(double));
             memcpy(covariance + (size_t)k * na * na, b.P, (size_t)na * na * sizeof(double));
             memcpy(transition + (size_t)k * na * na, b.T, (size_t)na * na * sizeof(double));
         }
         filled = k + 1;
-        memset(b.T, 0, (size_t)na * na * sizeof(double));
-        for (int i = 0; i < na; i++) b.T[i * na + i] = 1.0;
-        if (!used[k] || !(variance > 0.0)) continue;
+        if (!used[k] || !(e.variance > 0.0)) continue;
         int far = 0;
         for (int i = 0; i < na; i++) {
-            double gain = PH[i] / variance, move = gain * miss;
-            lanes dgain = (dPH[i] - gain * dvariance) / variance, dmove = dgain * miss + gain * dmiss;
+            double gain = e.PH[i] / e.variance, move = gain * e.miss;
+            lanes dgain = (e.dPH[i] - gain * e.dvariance) / e.variance, dmove = dgain * e.miss + gain * e.dmiss;
             int held = i < NX && fabs(move) > bound[i].v; /* the equations are not linear so far */
             if (slopes) {
-                for (int j = 0; j < na; j++) add_scaled(LANES, -PH[j], &dgain, b.Pd + i * na + j);
-                add_scaled(na * LANES, -gain, dPH, b.Pd + i * na);
+                for (int j = 0; j < na; j++) add_scaled(LANES, -e.PH[j], &dgain, b.Pd + i * na + j);
+                add_scaled(na * LANES, -gain, e.dPH, b.Pd + i * na);
             }
-            for (int j = 0; j < na; j++) b.P[i * na + j] -= gain * PH[j];
+            for (int j = 0; j < na; j++) b.P[i * na + j] -= gain * e.PH[j];
             if (held) {
                 dmove = move < 0.0 ? -bound[i].d : bound[i].d;
                 move = copysign(bound[i].v, move);
@@ -540,5 +789,6 @@ end:
     stats[0] = course.steps;
     stats[1] = course.rejected;
     stats[2] = bounded;
+    stats[3] = relinearised;
     return filled;
 }

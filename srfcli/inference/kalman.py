@@ -1,7 +1,9 @@
 """The Kalman filter of one run on a random friction field, and its smoother; exact derivatives of all that the filter returns.
 
 The extended filter in continuous time with samples (Jazwinski 1970): the mean follows the model's own integrator, the covariance
-the exact derivative of each of its steps. The smoother runs backward over what the filter kept (de Jong, Biometrika 76, 1989).
+the exact derivative of each of its steps. Where a reading moves the state too far for that, in a fall, the equations are
+linearised again about the state before, as the reading corrects it (Wishner, Tabaczynski and Athans, Automatica 5, 1969). The
+smoother runs backward over what the filter kept (de Jong, Biometrika 76, 1989).
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from srfcli.core.errors import SrfError
 from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.integrators import doubles, imposed_arguments, integers, interruptible, rtol_of_estimate
 
+LINEAR_MOVE = 0.05  # of a logarithm, by a reading, up to which the equations are linear
+NONLINEARITY = 0.02  # difference of a reading from its tangent, over its white noise, that is none
 STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
 
 GAUGE, SPRING = -1, -2  # what a reading shows: the elongation as the gauge has it, or as it is; from 0 on a state
@@ -116,6 +120,7 @@ def kalman_filter(
     keep: bool,
     most: int | None,
     farthest: float,
+    linear_move: float = LINEAR_MOVE,
 ) -> Innovations:
     """Return the innovations of the readings.
 
@@ -126,6 +131,8 @@ def kalman_filter(
     numbers in the same k directions. A reading moves ln v and ln PHI by no more than `farthest`, and the field by as many of its
     standard deviations, as what it says of them is linear: beside the fall of a stick-slip cycle that may be a velocity of any
     size, which cannot be followed. Each reading is still predicted from those before it alone, so that the likelihood is one.
+    Where one moves them by more than `linear_move`, and what it then shows is not on its tangent, the equations are linearised
+    again.
     After `most` steps, 50 a sample if that is None, the rest is NaN. Raises SrfError without a compiler, or for a model without a
     random friction field.
     """
@@ -144,7 +151,8 @@ def kalman_filter(
     nu_d, S_d = np.full((n, k), np.nan), np.full((n, k), np.nan)
     shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide), (n, wide)) if keep else ((1,),) * 5
     arrays = [np.full(shape, np.nan) for shape in shapes]
-    stats, stop, reached = np.zeros(3), ctypes.c_int(0), n
+    logarithm, linear = integers(np.char.startswith(model.states, "ln_")), doubles(np.array([linear_move, NONLINEARITY]))
+    stats, stop, reached = np.zeros(4), ctypes.c_int(0), n
     imposed, use = imposed_arguments(read.t, drive, load), np.ascontiguousarray(read.used, dtype=np.uint8)
     size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000) if most is None else most
     allowed, bounds = np.asarray(atol) * size / rtol, _bounds(model, p, farthest)
@@ -156,8 +164,8 @@ def kalman_filter(
             len(order), orders, owners, doubles(gauge.packed(first)), rates, number, shows, doubles(read.weighs), weighed,
             int(k > 0), ctypes.c_double(size), doubles(allowed), ctypes.c_long(most), n, doubles(read.t), doubles(read.observed),
             ctypes.c_void_p(use.ctypes.data), doubles(read.factor.packed(first)), doubles(read.offset.packed(first)),
-            doubles(read.R.packed(first)), doubles(bounds.packed(first)), int(keeping), doubles(nu), doubles(S),
-            doubles(own_nu), doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),
+            doubles(read.R.packed(first)), doubles(bounds.packed(first)), logarithm, linear, int(keeping), doubles(nu),
+            doubles(S), doubles(own_nu), doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),
         )  # fmt: skip
         reached = min(reached, interruptible(lambda arguments=arguments: library.srf_filter(*arguments), stop))  # type: ignore[misc]
         count = min(LANES, k - first)

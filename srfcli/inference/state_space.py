@@ -32,7 +32,18 @@ from srfcli.data.noise import calm_level, carried
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import Fit, Problem, RunFit, inverse
-from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Readings, Smoothed, SmootherInput, kalman_filter, smooth
+from srfcli.inference.kalman import (
+    GAUGE,
+    LINEAR_MOVE,
+    SPRING,
+    Dual,
+    Innovations,
+    Readings,
+    Smoothed,
+    SmootherInput,
+    kalman_filter,
+    smooth,
+)
 from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
     basis,
@@ -252,6 +263,7 @@ def filter_run(
     keep: bool = False,
     most: int | None = None,
     farthest: float = np.inf,
+    linear_move: float = LINEAR_MOVE,
 ) -> Filtered:
     """Return `run` filtered under `values` (um, s, N), with derivatives by the parameters `by`.
 
@@ -260,7 +272,8 @@ def filter_run(
     exponentially or `gauge_frequency1` (Hz) and `gauge_quality1` if it is an oscillator's, and so on up to 3 of these, and what
     belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. `gauges` say by which names they have those of the gauge: for each
     signal, one after the other, one for each of the run's sampling rates. After `most` steps it is given up. `farthest` is how
-    far a reading may move the state, as `kalman_filter` has it.
+    far a reading may move the state, and `linear_move` how far before the equations are linearised again, as `kalman_filter` has
+    them.
     """
     k, c, rates = len(by), len(run.signals), len(run.sampling.spacings)
     p = run_parameters(model, experiment, run, values)
@@ -283,6 +296,7 @@ def filter_run(
         gauge=Dual(gauge[0].reshape(rates, -1, 3), gauge[1].reshape(rates, c * len(rows), 3, k)),
         order=[len(row) - 1 for row in rows] * c, owner=np.repeat(np.arange(c), len(rows)).tolist(),
         rtol=rtol, atol=rtol * size * fine, keep=keep, most=most, farthest=farthest,
+        linear_move=linear_move,
     )  # fmt: skip
     return Filtered(run, tuple(by), found)
 
@@ -410,6 +424,7 @@ class Likelihood:
         self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
         self._last: dict[str, tuple[Array, Filtered]] = {}  # each run as it was filtered last, and where
+        self._friction = max([typical_friction(run) for run in problem.runs], default=0.0)
         scales = _scales(problem.runs) if problem.runs else {}
         self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
         own = dict.fromkeys(kind for run in problem.runs for kind in self.kinds_of(run))
@@ -506,14 +521,18 @@ class Likelihood:
     ) -> Filtered:
         """Return one run filtered under values by name, with derivatives by the names that it depends on."""
         gauges, problem, by = self.gauges(run), self.problem, self._dependences(run)
-        for farthest in (np.inf, MAX_UPDATE):  # held back where it cannot be followed otherwise
-            found = filter_run(
+
+        def filtered(**how: float) -> Filtered:
+            return filter_run(
                 problem.model, problem.experiment, run, problem.local(run, values), by=tuple(by.values()) if slopes else (),
-                gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
-                farthest=farthest,
+                gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most, **how,
             )  # fmt: skip
-            if found.whole:
-                break
+
+        # a wide field holds the state to the readings, and then their tangents do
+        faint = values["field_amplitude"] < FAINT_FIELD * self._friction
+        found = filtered(linear_move=LINEAR_MOVE if faint else np.inf)
+        if not found.whole:  # held back where it cannot be followed otherwise
+            found = filtered(farthest=MAX_UPDATE, linear_move=np.inf)
         return replace(found, names=tuple(by) if slopes else ())
 
     def _dependences(self, run: Run) -> dict[str, str]:
