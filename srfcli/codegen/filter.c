@@ -441,9 +441,8 @@ typedef struct {
     int segment;
 } Place;
 
-/* what is expected of a reading: `there` at the state about which it is linearised, which is the mean unless
-   that state was shifted; its gradient H (na), the covariance with it PH, innovation and variance; by how much the tangent leads
-   back (NX) from the shifted state to the mean */
+/* what is expected of a reading: `there` at the state about which it is linearised, the mean unless that was shifted; by how much
+   the tangent has the states `shifted` (NX); the reading's gradient H (na), covariances with it PH, innovation and variance */
 typedef struct {
     dual there, noise, shifted[NX];
     double H[NA], PH[NA], miss, variance;
@@ -583,8 +582,8 @@ static void expect(const Recording *run, int k, Place *at, const Course *course,
     }
 }
 
-/* how a reading corrects the belief before: of the states there (NX), which is their
-   covariance times `by` (na); the reading to which the tangent then leads, and its variance for a state before that is known */
+/* how a reading corrects the belief at the reading before: by how much it shifts the states there (NX), their covariances with what
+   is there (na) times `by`; the reading to which the tangent then leads, and the variance of that if the shifted state were known */
 typedef struct {
     dual shift[NX];
     double by[NA], ahead, variance;
