@@ -104,10 +104,9 @@ def fitted(folder: Path, concealed: dict[str, Any]) -> tuple[str, float, float, 
         values |= {longs.get(name, name): float(value) for name, value in of_an_effect(effect, truth).items()}
     values |= {"field_amplitude": concealed["rough"], "field_length": truth.track.length}
     sigma = concealed["gauge"]["sigma"] * (1e-3 if concealed["rig"] == "micro-force" else 1.0)  # mN there
-    coloured = sum(name.startswith("gauge_colour") for name in likelihood.names)
     for name in likelihood.names:
         if name.startswith("gauge_white"):
-            values[name] = sigma * math.sqrt(WHITE_SHARE if coloured else 1.0)
+            values[name] = sigma * math.sqrt(WHITE_SHARE if likelihood.processes else 1.0)
         elif name.startswith("gauge_colour"):
             values[name] = sigma * math.sqrt((1 - WHITE_SHARE) / len(likelihood.processes))
     beside = maximise(likelihood, likelihood.coordinates(values), fixed=problem.names, close=SEARCH_TOLERANCE)  # noise and field

@@ -252,6 +252,26 @@ def test_a_field_that_vanishes_leaves_the_deterministic_likelihood_of_stick_slip
     assert heights[-2] == pytest.approx(heights[-1], abs=1.0)
 
 
+def test_a_friction_that_is_one_unknown_number_has_the_likelihood_of_its_integral_in_stick_slip(make_model):
+    """A field far longer than the slip is such a number: quadrature over the deterministic model's likelihood is exact."""
+    own, sd, a, shift = MICRO, 0.01, 1e-4, 2e-4
+    model = make_model(**own.choice, random_field=True)
+    y = predict(model, own.experiment, own.run, own.values | {"mu0": own.values["mu0"] + shift}, rtol=1e-10).y
+    run = replace(own.run, observed=y + sd * np.random.default_rng(1).standard_normal(y.size))
+
+    def height(off: float, amplitude: float) -> float:
+        values = own.values | {"field_amplitude": amplitude, "field_length": 1e7, "gauge_white": sd}
+        values["mu0"] += off
+        return filter_run(model, own.experiment, run, values, rtol=1e-7).log_likelihood
+
+    grid = shift + np.linspace(-6e-5, 6e-5, 121)
+    heights = np.array([height(off, 0.0) for off in grid])
+    assert max(heights[0], heights[-1]) < heights.max() - 15  # all of it is within
+    prior = np.exp(-0.5 * (grid / a) ** 2) / (a * np.sqrt(2 * np.pi))
+    exact = heights.max() + np.log(np.sum(np.exp(heights - heights.max()) * prior) * (grid[1] - grid[0]))
+    assert height(0.0, a) == pytest.approx(exact, abs=1.0)
+
+
 def test_derivatives_of_every_function_that_a_law_may_have(tmp_path, make_model):
     """One law with all of them, by a number that stands inside and before each."""
     x, functions = "log(v/V0)", ("exp", "log1p", "expm1", "sin", "cos", "sinh", "cosh", "tanh", "asinh", "atan")

@@ -91,6 +91,16 @@ static int nonzero(const lanes *d) {
     return some;
 }
 
+/* derivatives out (NX, na) of Phi times x (NX, na), whose own are xd */
+static inline void step_derivatives(int na, const double *Phi, const lanes *dPhi, const double *x, const lanes *xd, lanes *out) {
+    memset(out, 0, (size_t)NX * na * sizeof *out);
+    for (int r = 0; r < NX; r++)
+        for (int k = 0; k < NX; k++) {
+            for (int c = 0; c < na; c++) add_scaled(LANES, x[k * na + c], dPhi + r * NC + k, out + r * na + c);
+            add_scaled(na * LANES, Phi[r * NC + k], xd + k * na, out + r * na);
+        }
+}
+
 /* whether there is nothing random about the states: no variance, and no noise of rate `gain` (3, NX) at any stage */
 static int certain(const Course *course, const Belief *b, const double *gain) {
     int some = 0;
@@ -215,22 +225,8 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
             M[r * na + c] = sum;
             G[r * na + c] = through;
         }
-    if (course->slopes) {
-        memset(dM, 0, sizeof dM);
-        for (int r = 0; r < NX; r++)
-            for (int k = 0; k < NX; k++) {
-                for (int c = 0; c < na; c++) add_scaled(LANES, b->P[k * na + c], dPhi + r * NC + k, dM + r * na + c);
-                add_scaled(na * LANES, Phi[r * NC + k], b->Pd + k * na, dM + r * na);
-            }
-    }
-    if (course->tangents) {
-        memset(dT, 0, sizeof dT);
-        for (int r = 0; r < NX; r++)
-            for (int k = 0; k < NX; k++) {
-                for (int c = 0; c < na; c++) add_scaled(LANES, b->T[k * na + c], dPhi + r * NC + k, dT + r * na + c);
-                add_scaled(na * LANES, Phi[r * NC + k], b->Td + k * na, dT + r * na);
-            }
-    }
+    if (course->slopes) step_derivatives(na, Phi, dPhi, b->P, b->Pd, dM);
+    if (course->tangents) step_derivatives(na, Phi, dPhi, b->T, b->Td, dT);
     for (int r = 0; r < NX; r++)
         for (int c = 0; c <= r; c++) {
             double sum = 0.0;
@@ -687,7 +683,7 @@ static int relinearise(const Recording *run, int k, const Place *was, Place *at,
         if (total > lowest) { /* towards the likeliest so far */
             halved = 1;
             for (int i = 0; i < NX; i++) shift[i] = srf_mul_c(srf_add(best.shift[i], shift[i]), 0.5);
-            for (int i = 0; i < NA; i++) by[i] = 0.5 * (best.by[i] + by[i]);
+            for (int i = 0; i < course->na; i++) by[i] = 0.5 * (best.by[i] + by[i]);
             continue;
         }
         halved = 0;

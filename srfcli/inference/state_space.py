@@ -546,6 +546,11 @@ class Likelihood:
             if n in own or (n not in others and ("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
         }
 
+    @cached_property
+    def _places(self) -> dict[str, list[int]]:
+        """Return the places of the coordinates that each run depends on."""
+        return {run.name: [self.names.index(n) for n in self._dependences(run)] for run in self.problem.runs}
+
     def held_out(self, run: Run, values: Mapping[str, float]) -> Filtered:
         """Return a run that was not fitted, filtered; what belongs to it alone, a free start, a trend, is estimated.
 
@@ -626,7 +631,7 @@ class Likelihood:
 
         def one(run: Run) -> Filtered:
             nonlocal failed  # then the others are not needed
-            own = x[[self.names.index(n) for n in self._dependences(run)]]
+            own = x[self._places[run.name]]
             last = self._last.get(run.name)
             if last is not None and not keep and (last[1].names or not slopes) and np.array_equal(own, last[0]):
                 return last[1]  # of what varies by group most runs do not depend
