@@ -13,7 +13,7 @@ from srfcli.cli import options
 from srfcli.cli.base import SrfCommand
 from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
 from srfcli.core.errors import SrfError, did_you_mean
-from srfcli.core.settings import Resolved, Setting, TomlSettings, choose, find_toml, load_toml, resolve
+from srfcli.core.settings import Setting, resolve
 from srfcli.core.units import describe, find_unit, parse_quantity, to_base
 
 if TYPE_CHECKING:
@@ -238,37 +238,31 @@ def compare(
     finish(found.status)
 
 
-def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, Any]) -> dict[str, SlidingSystem]:
-    """Return a system for every pair of a friction and an ageing law, by a name that tells them apart."""
-    from srfcli.codegen.slider import Opener, SlidingSystem
+def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], taken: dict[str, Any]) -> dict[str, SlidingSystem]:
+    """Return a system for every pair of a friction and an ageing law, by a name that tells them apart.
 
-    toml = load_toml(find_toml())
-    chosen = {k: choose(k, system[k], toml=toml) for k in ("interface", "loading", "inertia")}
-    chosen |= {k: choose(k, None, toml=toml) for k, given in (("law", laws), ("ageing", ageings)) if not given}
-    options.check_origins(toml, chosen)
-    shared = {k: chosen[k].value for k in ("interface", "loading", "inertia")}
-    named = (*chosen.values(), *(Setting(name, "flag") for name in (*laws, *ageings)))
-    laws, ageings = laws or (chosen["law"].value,), ageings or (chosen["ageing"].value,)
-    pairs = list(dict.fromkeys(itertools.product(laws, ageings)))
+    An assignment counts for the models that have its parameter, and one must.
+    """
+    from srfcli.codegen.slider import SlidingSystem
+
+    system = options.read_system(law=None, ageing=None, **taken)
+    chosen = [[Setting(name, "flag") for name in laws] or [system.chosen["law"]]]
+    chosen.append([Setting(name, "flag") for name in ageings] or [system.chosen["ageing"]])
+    pairs = {(law.value, ageing.value): {"law": law, "ageing": ageing} for law, ageing in itertools.product(*chosen)}
     if len(pairs) < 2:
         raise SrfError("one law is nothing to compare", "Name more: --law srf-vsat --law log-log, or several --ageing.")
-    registry = options.open_registry(system["plugins"], named)
-    openers = [Opener(registry, {"law": law, "ageing": ageing, **shared}) for law, ageing in pairs]
-    models = [opener.model for opener in openers]
-    short = len(set(ageings)) == 1, len(set(laws)) == 1
-    names = [law if short[0] else ageing if short[1] else f"{law}/{ageing}" for law, ageing in pairs]
-    parts = zip(names, _resolved(models, system, toml), openers, models, strict=True)
-    return {name: SlidingSystem(resolved, opener, model.title) for name, resolved, opener, model in parts}
-
-
-def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSettings) -> list[Resolved]:
-    """Return every model's parameters; an assignment counts for the models that have its parameter, and one must."""
-    flags = options.read_flags(system, system["assignments"])
-    known = {n for m in models for n in m.names}
-    for name in flags:
+    openers = [replace(system, chosen={**system.chosen, **pair}).opener() for pair in pairs.values()]
+    known = {n for opener in openers for n in opener.model.names}
+    for name in system.flags:
         if name not in known:
             raise SrfError(f"unknown parameter {name!r} in all of these laws", did_you_mean(name, known))
-    return [resolve(m.parameters, {n: v for n, v in flags.items() if n in m.names}, toml=toml, where=m.title) for m in models]
+    found = {}
+    for (law, ageing), opener in zip(pairs, openers, strict=True):
+        name = law if len(set(ageings)) < 2 else ageing if len(set(laws)) < 2 else f"{law}/{ageing}"
+        model, own = opener.model, {n: v for n, v in system.flags.items() if n in opener.model.names}
+        resolved = resolve(model.parameters, own, toml=system.toml, where=model.title)
+        found[name] = SlidingSystem(resolved, opener, model.title)
+    return found
 
 
 def _window(model: GeneratedModel, over: tuple[options.Range, ...]) -> dict[str, Any]:

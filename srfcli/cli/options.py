@@ -399,9 +399,10 @@ def _as_one(name: str, read: Callable[..., Any], options: Options) -> Callable[[
     return decorate
 
 
-def _read_system(
+def read_system(
     *, assignments: Sequence[str], plugins: tuple[Path, ...], effects: tuple[str, ...] = (), **taken: Any
 ) -> SystemOptions:
+    """Return what the values of SYSTEM_OPTIONS choose, those that are None by the environment, srf.toml or the default."""
     toml = load_toml(find_toml())
     chosen = {key: choose(key, taken[key], toml=toml) for key in CHOICES}
     flags = read_flags(taken, assignments)
@@ -409,8 +410,8 @@ def _read_system(
 
 
 # the command gets `system`, a SystemOptions
-system_options = _as_one("system", _read_system, SYSTEM_OPTIONS)
-options_with_effects = _as_one("system", _read_system, {**SYSTEM_OPTIONS, "effects": EFFECTS_OPTION})
+system_options = _as_one("system", read_system, SYSTEM_OPTIONS)
+options_with_effects = _as_one("system", read_system, {**SYSTEM_OPTIONS, "effects": EFFECTS_OPTION})
 
 
 def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,7 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.data.values import CriticalLoads, Run
 from srfcli.diagnosis.design import DiscriminatingRun, described
-from srfcli.diagnosis.discrepancy import smoothed_friction_field
-from srfcli.diagnosis.residual_scan import Location, ScanStatistic
+from srfcli.diagnosis.residual_scan import Location
 from srfcli.diagnosis.verdict import Diagnosis, parameters_of
 from srfcli.inference.state_space import Filtered
 
@@ -138,50 +137,6 @@ def pooled_rms(views: Sequence[RunView | LoadView], place: int) -> float | None:
     sizes = np.array([v.size for v in views], dtype=float)
     squares = np.array([v.rms[place] ** 2 for v in views])
     return float(np.sqrt(sizes @ squares / sizes.sum()))
-
-
-def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
-    """Return the arrays and tables of which figures and report are made, by name."""
-    windows = {r.name: [list(w) for w in r.windows] for r in location.runs}
-    friction = [smoothed_friction_field(f, with_parameters=False) for f in (diagnosis.baseline, diagnosis.best)]
-    runs = []
-    for v in run_views(diagnosis):
-        runs.append({
-            "name": v.run.name, "holdout": v.run.holdout, "t": v.run.t, "observed": v.run.observed, "used": v.run.used,
-            "baseline": v.baseline, "augmented": v.augmented, "V": v.run.drive(v.run.t),
-            "W": v.run.load(v.run.t)[0], "windows": windows.get(v.run.name, []),
-            "rms": list(v.rms), "white": list(v.white),
-            "friction": [None if v.run.holdout else found[v.run.name].force if v.run.name in found else np.zeros(v.run.t.size)
-                         for found in friction],  # what a model leaves to its field
-        })  # fmt: skip
-    tables = [
-        {"name": v.loads.name, "holdout": v.loads.holdout, "table": v.loads.table, "baseline": v.baseline,
-         "augmented": v.augmented, "chi2": list(v.chi2)}
-        for v in load_views(diagnosis)
-    ]  # fmt: skip
-    effects = [e for f in (*diagnosis.ranked, diagnosis.best) for e in f.hypothesis.effects]  # variants: the augmented model's
-    return {
-        "title": diagnosis.experiment.title,
-        "about": {e.reported: e.about for e in effects},
-        "texts": {e.reported: {"wrong": e.wrong, "remedy": e.remedy} for e in effects},
-        "runs": runs,
-        "thresholds": tables,
-        "residual_scan": [scan_row(row) for row in location.rows],
-        "ranked": ranked_rows(diagnosis),
-        "parameters": parameter_rows(diagnosis),
-        "scores": [
-            {"effect": s.effect.name} | {key: getattr(s, key) for key in ("gain", "size", "stderr", "tolerance", "detectable")}
-            for s in diagnosis.scores
-        ],
-    }
-
-
-def scan_row(row: ScanStatistic) -> dict[str, Any]:
-    """Return a place of the residual scan, v in um/s and phi in s, by whose logarithms samples were sorted."""
-    found = asdict(row)
-    if row.axis in ("v", "phi"):
-        found |= {"low": float(np.exp(row.low)), "high": float(np.exp(row.high))}
-    return found
 
 
 def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:

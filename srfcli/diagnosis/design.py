@@ -15,7 +15,7 @@ motion itself in place of its derivatives.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
 from pathlib import Path
@@ -243,13 +243,25 @@ class Design:
             if found is None:
                 return None
             y[rival.name] = found
-        apart = []
+        losses = self.losses(y, lambda wrong, shown: wrong.lack_of_fit(run, shown, slopes=False))
+        if losses is None:
+            return None
+        return PredictedRun(proposal, run, y, min(0.5 * float(lost.w @ lost.w) for lost in losses.values()))
+
+    def losses(
+        self, y: Mapping[str, Array], lack: Callable[[RivalModel, Array], LackOfFit | None]
+    ) -> dict[tuple[str, str], LackOfFit] | None:
+        """Return what is lost by the names of a true and a wrong hypothesis; None where a wrong one cannot be followed.
+
+        `lack` returns what a wrong one loses where the prediction (n,) of `y` by the true one is shown.
+        """
+        found = {}
         for true, wrong in self.pairs:
-            lost = wrong.lack_of_fit(run, y[true.name], slopes=False)
+            lost = lack(wrong, y[true.name])
             if lost is None:
                 return None
-            apart.append(0.5 * float(lost.w @ lost.w))
-        return PredictedRun(proposal, run, y, min(apart))
+            found[true.name, wrong.name] = lost
+        return found
 
     def stably_started(self, proposal: Proposal) -> tuple[Proposal, Run] | None:
         """Return a run that begins in stable sliding, whichever hypothesis is true: as it is, or led in."""
@@ -262,22 +274,14 @@ class Design:
 
     def gain(self, trial: PredictedRun) -> float:
         """Return the gain at first order: that of the pair least apart, the worse way round."""
-        least = np.inf
-        for true, wrong in self.pairs:
-            lost = wrong.lack_of_fit(trial.run, trial.y[true.name])
-            if lost is None:
-                return 0.0
-            least = min(least, lost.gain())
-        return least
+        losses = self.losses(trial.y, lambda wrong, shown: wrong.lack_of_fit(trial.run, shown))
+        return min(lost.gain() for lost in losses.values()) if losses else 0.0
 
     def judge(self, trial: PredictedRun) -> DiscriminatingRun | None:
         """Return what a run is worth, every wrong model refitted by the motion itself."""
-        losses: dict[tuple[str, str], LackOfFit] = {}
-        for true, wrong in self.pairs:
-            lost = self.refitted(trial.run, wrong, trial.y[true.name])
-            if lost is None:
-                return None
-            losses[true.name, wrong.name] = lost
+        losses = self.losses(trial.y, lambda wrong, shown: self.refitted(trial.run, wrong, shown))
+        if losses is None:
+            return None
         worth = {pair: lost.gain() for pair, lost in losses.items()}
         true_name, wrong_name = min(worth, key=lambda pair: worth[pair])
         seconds, repeats = _sufficient_duration(list(losses.values()), trial)

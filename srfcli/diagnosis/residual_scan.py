@@ -13,7 +13,7 @@ are far off where the physics is missing.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -65,10 +65,7 @@ class Location:
     def described(self) -> dict[str, object]:
         """Return the object that `srf.diagnose/1` has under location."""
         return {
-            "runs": [
-                {"name": r.name, "share": r.share, "windows": [list(w) for w in r.windows], "p_value": r.p_value}
-                for r in self.runs
-            ],
+            "runs": [asdict(r) for r in self.runs],
             "forcing_phase": None if self.forcing_phase is None else list(self.forcing_phase),
             "frequencies_hz": list(self.frequencies),
             "coordinate": None if self.coordinate is None else {"name": self.coordinate[0], "r2": self.coordinate[1]},

@@ -7,7 +7,7 @@ import math
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,9 +17,10 @@ import numpy as np
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
 from srfcli.data.values import Run
-from srfcli.diagnosis.answer import RunView, answer, load_views, material, parameter_rows, ranked_rows, run_views
+from srfcli.diagnosis.answer import RunView, answer, load_views, parameter_rows, ranked_rows, run_views
 from srfcli.diagnosis.design import DiscriminatingRun, discriminating_files
-from srfcli.diagnosis.residual_scan import Location
+from srfcli.diagnosis.discrepancy import smoothed_friction_field
+from srfcli.diagnosis.residual_scan import Location, ScanStatistic
 from srfcli.diagnosis.search import Fitted
 from srfcli.diagnosis.verdict import Diagnosis, added, at_bounds
 from srfcli.laws.registry import Registry
@@ -240,20 +241,49 @@ class DiagnosisResult(Result):
 
     @cached_property
     def _material(self) -> dict[str, Any]:
-        """Return what figures and report are made of, in the units of the recordings."""
-        made, experiment = material(self.diagnosis, self.location), self.diagnosis.experiment
-        runs = {run.name: run for run in experiment.runs}
-        for shown in made["runs"]:
-            run = runs[shown["name"]]
+        """Return the arrays and tables of which figures and report are made, by name, in the units of the recordings."""
+        diagnosis, experiment = self.diagnosis, self.diagnosis.experiment
+        windows = {r.name: [list(w) for w in r.windows] for r in self.location.runs}
+        friction = [smoothed_friction_field(f, with_parameters=False) for f in (diagnosis.baseline, diagnosis.best)]
+        runs = []
+        for v in run_views(diagnosis):
+            run = v.run
             unit = f"  [{unit_text(run.unit)}]" if run.unit != "1" else ""
-            shown |= {"label": f"{run.quantity}{unit}", "load_unit": run.load_unit}
-        made |= {"parameters": self._parameters, "alternatives": self._alternatives}
+            runs.append({
+                "name": run.name, "holdout": run.holdout, "label": f"{run.quantity}{unit}", "load_unit": run.load_unit,
+                "t": run.t, "observed": run.observed, "used": run.used, "baseline": v.baseline, "augmented": v.augmented,
+                "V": run.drive(run.t), "W": run.load(run.t)[0], "windows": windows.get(run.name, []),
+                "rms": list(v.rms), "white": list(v.white),
+                "friction": [None if run.holdout else found[run.name].force if run.name in found else np.zeros(run.t.size)
+                             for found in friction],  # what a model leaves to its field
+            })  # fmt: skip
+        tables = [
+            {"name": v.loads.name, "holdout": v.loads.holdout, "table": v.loads.table, "baseline": v.baseline,
+             "augmented": v.augmented, "chi2": list(v.chi2)}
+            for v in load_views(diagnosis)
+        ]  # fmt: skip
         stiffness, unit = experiment.shown_stiffness
-        made["stated"] = {"stiffness": f"{stiffness:.4g} {unit_text(unit)}", "ageing": experiment.choice.ageing}
-        made["laws"] = sorted({ranked.hypothesis.ageing for ranked in self.diagnosis.ranked} - {""})
-        effects = [effect for ranked in self.diagnosis.ranked for effect in ranked.hypothesis.effects]
-        made["own"] = {effect.reported: [*(p.name for p in effect.parameters), *effect.frees] for effect in effects}
-        return made
+        tried = [e for ranked in diagnosis.ranked for e in ranked.hypothesis.effects]
+        effects = [*tried, *diagnosis.best.hypothesis.effects]  # variants: the augmented model's
+        return {
+            "title": experiment.title,
+            "about": {e.reported: e.about for e in effects},
+            "texts": {e.reported: {"wrong": e.wrong, "remedy": e.remedy} for e in effects},
+            "own": {e.reported: [*(p.name for p in e.parameters), *e.frees] for e in tried},
+            "laws": sorted({ranked.hypothesis.ageing for ranked in diagnosis.ranked} - {""}),
+            "stated": {"stiffness": f"{stiffness:.4g} {unit_text(unit)}", "ageing": experiment.choice.ageing},
+            "runs": runs,
+            "thresholds": tables,
+            "residual_scan": list(map(_scan_row, self.location.rows)),
+            "ranked": ranked_rows(diagnosis),
+            "parameters": self._parameters,
+            "alternatives": self._alternatives,
+            "scores": [
+                {"effect": s.effect.name}
+                | {key: getattr(s, key) for key in ("gain", "size", "stderr", "tolerance", "detectable")}
+                for s in diagnosis.scores
+            ],
+        }
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the run that the verdict rests on most: recording, both models, innovations, friction field, what was imposed.
@@ -355,6 +385,14 @@ class DiagnosisResult(Result):
                     raise
                 told(f"Warning: no report: {type(error).__name__}: {error}")
         return augmented.options(folder / "augmented")
+
+
+def _scan_row(row: ScanStatistic) -> dict[str, Any]:
+    """Return a place of the residual scan, v in um/s and phi in s, by whose logarithms samples were sorted."""
+    found = asdict(row)
+    if row.axis in ("v", "phi"):
+        found |= {"low": float(np.exp(row.low)), "high": float(np.exp(row.high))}
+    return found
 
 
 def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:

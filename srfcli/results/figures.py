@@ -82,9 +82,13 @@ def recordings(checks: Sequence[RunCheck], *, title: str = "") -> Figure:
 
 def stacked(figure: Figure, cell: Any, heights: Sequence[float], *, hspace: float) -> list[Axes]:
     """Return panels above each other on one x axis, in a cell of a grid."""
-    rows = cell.subgridspec(len(heights), 1, height_ratios=heights, hspace=hspace)
-    first = figure.add_subplot(rows[0])
-    return [first, *(figure.add_subplot(rows[i], sharex=first) for i in range(1, len(heights)))]
+    return on_one_axis(figure, list(cell.subgridspec(len(heights), 1, height_ratios=heights, hspace=hspace)))
+
+
+def on_one_axis(figure: Figure, cells: Sequence[Any]) -> list[Axes]:
+    """Return a panel in each cell, all on one x axis."""
+    first = figure.add_subplot(cells[0])
+    return [first, *(figure.add_subplot(cell, sharex=first) for cell in cells[1:])]
 
 
 def fix_layout(figure: Figure) -> None:

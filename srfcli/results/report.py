@@ -501,11 +501,9 @@ FIGURES = "figures"
 def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str, Any]) -> tuple[Path, ...]:
     """Write report.html and figures/*.svg, *.png into `folder`, each whole or not at all, and return their places.
 
-    `answer` is the object of the format srf.diagnose/1. `material` is that of `srfcli.diagnosis.answer.material`, in units of the
-    recordings, its runs with label and load_unit, and besides:
-    stated {stiffness, ageing}; laws: other ageing laws that were fitted; own {effect: its parameters};
-    and, where there are any, alternatives: each model of an ambiguous verdict, with its parameters, as text; discriminating:
-    paragraphs on that run; force {run: {t, force, band (2, n), v, phi, W}, "form": text}; diagram, as `diagram_figure` takes it.
+    `answer` is the object of the format srf.diagnose/1. `material` is that of a `DiagnosisResult`, and where there are any
+    discriminating: paragraphs on that run; force {run: {t, force, band (2, n), v, phi, W}, "form": text}; diagram, as
+    `diagram_figure` takes it.
     Without matplotlib the page has all but the figures, and says so.
     """
     folder.mkdir(parents=True, exist_ok=True)

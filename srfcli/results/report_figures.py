@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.diagnosis.residual_scan import SIGNIFICANT
-from srfcli.results.figures import draw_loads, envelope, fix_layout, imposed_scale
+from srfcli.results.figures import draw_loads, envelope, fix_layout, imposed_scale, on_one_axis
 from srfcli.results.plots import DOTTED, bare_figure, curve_style, decade_ticks, house_style, name_text, new_figure
 from srfcli.results.report_text import finite, number, with_unit
 
@@ -183,7 +183,7 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
         figure = bare_figure((NARROW_FIGURE if narrow else 10.4 if piece else 9.0, 0.72 * sum(heights) + 1.1))
         widths = (1.75, 1.0) if piece else (1.0,)
         grid = figure.add_gridspec(len(heights), len(widths), height_ratios=heights, width_ratios=widths)
-        axes = _column(figure, grid, 0, [slice(i, i + 1) for i in range(len(heights))])
+        axes = on_one_axis(figure, [grid[i, 0] for i in range(len(heights))])
         _shade(axes, one)
         _whole(axes, one, narrow=narrow)
         if one.friction_field is not None:
@@ -193,7 +193,7 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
         _end_column(axes)
         if piece:
             last = len(heights) - ("W" in imposed)
-            near = _column(figure, grid, 1, (slice(0, 1), slice(1, last), slice(last, None))[: 2 + ("W" in imposed)])
+            near = on_one_axis(figure, [grid[0, 1], grid[1:last, 1], *([grid[last:, 1]] if "W" in imposed else [])])
             _near(near, one, piece)
             for axis in near[2:]:
                 _imposed_panel(axis, one, "W", piece)
@@ -201,11 +201,6 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
             axes[0].axvspan(one.t[piece][0], one.t[piece][-1], ymin=0.0, ymax=0.03, color="#000000", linewidth=0)
         fix_layout(figure)
         return figure
-
-
-def _column(figure: Figure, grid: Any, column: int, rows: Sequence[slice]) -> list[Axes]:
-    axes = [figure.add_subplot(grid[rows[0], column])]
-    return axes + [figure.add_subplot(grid[place, column], sharex=axes[0]) for place in rows[1:]]
 
 
 def _end_column(axes: Sequence[Axes]) -> None:
