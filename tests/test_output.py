@@ -18,7 +18,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_target, write_atomic
 from srfcli.laws.values import Law
 from srfcli.results import plots
-from srfcli.results.provenance import Provenance, describe, sidecar
+from srfcli.results.provenance import Provenance, sidecar
 from srfcli.results.tables import Column, Table, print_terminal, to_csv, to_json, to_text
 
 COLUMNS = (Column("V", "um/s", "driving velocity", ".4g"), Column("W0", "N"), Column("type"), Column("status"))
@@ -147,7 +147,6 @@ def test_a_sidecar_is_stable_but_for_its_timings(tmp_path: Path) -> None:
     source.write_text("mu = 'mu0'")
     kept: dict[str, Any] = {"arguments": ("linear",), "laws": (Law("l", source=str(source)),), "inputs": (source,), "seed": 3}
     first, second = (Provenance(**kept, timings={"solve": t}) for t in (0.1, 0.2))
-    assert describe(first) == describe(second)
     texts = [sidecar(place, b"abc", p) for p in (first, second)]
     assert texts[0] != texts[1]
     assert texts[0].split('"timings"')[0] == texts[1].split('"timings"')[0]

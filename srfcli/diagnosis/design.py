@@ -133,8 +133,7 @@ class RivalModel:
 
     def predicted(self, run: Run) -> Array | None:
         """Return what the hypothesis predicts (n,), on a smooth track; None if it cannot be followed."""
-        values = {**self.values(), "field_amplitude": 0.0}
-        found = predict(self.problem.model, self.problem.experiment, run, values)
+        found = predict(self.problem.model, self.problem.experiment, run, {**self.values(), "field_amplitude": 0.0})
         return found.y if found.status.ok and np.isfinite(found.y).all() else None
 
     def lack_of_fit(self, run: Run, y: Array, z: Array | None = None, *, slopes: bool = True) -> LackOfFit | None:

@@ -346,23 +346,18 @@ class FitResult(Result):
         if found.friction_field is not None:
             notes.append(str(found.friction_field))
         notes += self.against
-        own: list[str] = []
+        own, uneven, coarse = list[str](), list[str](), list[str]()
         if found.state_space is not None and found.status is not Status.INTERRUPTED:
-            from srfcli.diagnosis.goodness_of_fit import own_levels
+            from srfcli.diagnosis.goodness_of_fit import coarse_readings, own_levels, uneven_noise
 
-            own = own_levels(found.state_space)
-            notes += own
+            own, uneven, coarse = (told_of(found.state_space) for told_of in (own_levels, uneven_noise, coarse_readings))
+        notes += own
         if self._field_share > WIDE_FIELDS[0][0] and not own:
             notes.append(
                 "under so wide a field a recording is followed whatever the parameters are, and the maximum may be a wrong one: "
                 "try --starts 5, or start values nearer to what is known"
             )
-        coarse: list[str] = []
-        if found.state_space is not None and found.status is not Status.INTERRUPTED:
-            from srfcli.diagnosis.goodness_of_fit import coarse_readings, uneven_noise
-
-            coarse = coarse_readings(found.state_space)
-            notes += [*uneven_noise(found.state_space), *coarse]
+        notes += [*uneven, *coarse]
         if self.against and not (coarse and fit.rms_over_noise() < 1):  # such a fit leaves less than the rounding it allows for
             notes.append(
                 "the model does not explain the recordings: the values may be wrong by more than their errors. "

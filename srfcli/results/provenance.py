@@ -56,14 +56,10 @@ def write_result(path: Path, content: bytes, provenance: Provenance | None) -> P
 
 def sidecar(path: Path, content: bytes, provenance: Provenance) -> str:
     """Return the text of the sidecar of the result `content` at `path`; the timings are its last key."""
-    data = {"schema": SCHEMA, "file": path.name, "sha256": hashlib.sha256(content).hexdigest(), **describe(provenance)}
-    data["timings"] = {name: round(seconds, 6) for name, seconds in provenance.timings.items()}
-    return json_text(plain_value(data), indent=2) + "\n"
-
-
-def describe(provenance: Provenance) -> dict[str, Any]:
-    """Return all but the timings as plain data: equal runs give equal data; of a file its hash."""
-    return {
+    data = {
+        "schema": SCHEMA,
+        "file": path.name,
+        "sha256": hashlib.sha256(content).hexdigest(),
         "arguments": list(provenance.arguments),
         "versions": versions(),
         "laws": [
@@ -71,9 +67,11 @@ def describe(provenance: Provenance) -> dict[str, Any]:
             for x in provenance.laws
         ],
         "parameters": provenance.parameters,
-        "inputs": {str(path): file_hash(path) for path in provenance.inputs},
+        "inputs": {str(place): file_hash(place) for place in provenance.inputs},
         "seed": provenance.seed,
+        "timings": {name: round(seconds, 6) for name, seconds in provenance.timings.items()},
     }
+    return json_text(plain_value(data), indent=2) + "\n"
 
 
 def file_hash(path: Path) -> str | None:

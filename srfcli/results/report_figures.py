@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.diagnosis.residual_scan import SIGNIFICANT
+from srfcli.diagnosis.residual_scan import SIGNIFICANT, TIME_AXES
 from srfcli.results.figures import draw_loads, envelope, fix_layout, imposed_scale, on_one_axis
 from srfcli.results.plots import DOTTED, bare_figure, curve_style, decade_ticks, house_style, name_text, new_figure
 from srfcli.results.report_text import finite, number, with_unit
@@ -380,7 +380,6 @@ PANEL_BINS = 3  # of an axis, from which it has a panel of its own
 SPECTRUM_COLUMNS = 240  # columns in which a spectrum is drawn by its maxima
 THIN = 0.003  # of an axis: a bin so narrow is a line, as it would hardly be seen as a bar
 WIDE_AXIS = 100.0  # ratio from which an axis is logarithmic
-TIME_AXES = ("run", "window")  # axes that the figures of the runs show
 
 # name: what it is in words, its unit; that of a load is the recordings'
 AXES: dict[str, tuple[str, str]] = {
@@ -460,7 +459,7 @@ def scan_figure(rows: Sequence[Mapping[str, Any]], load_unit: str, *, narrow: bo
     """Return a panel for each axis of the residual scan with several bins, but runs and times; None where there is none."""
     by_axis: dict[str, list[ScanRow]] = {}
     for spot in scan_rows(rows, load_unit):
-        if spot.axis not in TIME_AXES and spot.kind != "shape":
+        if spot.axis not in TIME_AXES and spot.kind != "shape":  # the figures of the runs show times
             by_axis.setdefault(spot.axis, []).append(spot)
     shown = {k: v for k, v in by_axis.items() if len({(s.low, s.high) for s in v}) >= PANEL_BINS}
     if not shown:

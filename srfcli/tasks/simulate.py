@@ -203,10 +203,15 @@ def record_of(
             "under an inclined spring W0 is the load in steady sliding at V, and the drive changes its velocity",
             "Drive at one velocity, or leave out `loading`.",
         )
-    modulation = (values["f"], values["eps"], _onset(onset, begin)) if values["eps"] else None
-    if modulation is not None:
-        f, eps, since = modulation
-        shape = Modulation(1.0, eps, f, since)
+    modulation = None
+    if values["eps"]:
+        if onset is not None and not onset >= begin:
+            raise SrfError(
+                f"`onset` {onset:g} s lies before the record, which begins at {begin:g} s",
+                "Sliding is steady before the first sample: the modulation begins with it or later.",
+            )
+        modulation = values["f"], values["eps"], begin if onset is None else onset
+        shape = Modulation(1.0, modulation[1], modulation[0], modulation[2])
         load = replace(shape, W0=load.W0) if isinstance(load, ConstantLoad) else ModulatedLoad(load, shape)
     elif onset is not None:
         raise SrfError("`onset` is given and nothing is modulated", "Give the amplitude, too: `eps` 0.09.")
@@ -220,18 +225,6 @@ def record_of(
     job = Job("simulated", p, drive, load, t, state, observables[0], modulation, beside=tuple(observables[1:]))
     work = Work(model, (job,), system.described(without=replaced))
     return work if on is None else on_field(work, *on, start=start)
-
-
-def _onset(onset: float | None, begin: float) -> float:
-    """Return when the modulation begins to rise, at `begin` (s) if left out."""
-    if onset is None:
-        return begin
-    if not onset >= begin:
-        raise SrfError(
-            f"`onset` {onset:g} s lies before the record, which begins at {begin:g} s",
-            "Sliding is steady before the first sample: the modulation begins with it or later.",
-        )
-    return onset
 
 
 def _as_effects_ask(load: Load, t: Array) -> dict[str, float]:
