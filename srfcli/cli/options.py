@@ -257,15 +257,20 @@ class SystemOptions:
         named = (Setting(name, "flag") for name in self.effects)
         return open_registry(self.plugins, (*(self.chosen[key] for key in LAW_CHOICES), *named))
 
-    def _names(self) -> dict[str, Any]:
-        check_origins(self.toml, {key: self.chosen[key] for key in LAW_CHOICES})
-        return {key: setting.value for key, setting in self.chosen.items()}
-
     def opener(self) -> Opener:
-        """Return what opens the formulas and the models of the system that the options name."""
-        from srfcli.codegen.slider import Opener
+        """Return what opens the formulas and the models of the system that the options name.
 
-        return Opener(self.registry(), self._names(), self.effects)
+        Raises SrfError for a Python file that srf.toml names, unless --trust is given: srf.toml may be a stranger's.
+        """
+        from srfcli.codegen.slider import Opener
+        from srfcli.laws.registry import untrusted_hint
+
+        for key in LAW_CHOICES:
+            for word in map(str.strip, str(self.chosen[key].value).split("+")):
+                if word.endswith(".py") and self.chosen[key].origin == self.toml.origin and not Session.current().trust:
+                    said = f"{self.toml.origin}: [defaults] {key}: '{word}' is Python code, which a file may not have run"
+                    raise SrfError(said, untrusted_hint(word))
+        return Opener(self.registry(), {key: setting.value for key, setting in self.chosen.items()}, self.effects)
 
     def resolve(self, parameters: Sequence[Parameter], **given: str | float | None) -> Resolved:
         """Return every parameter's value and origin.
@@ -318,19 +323,6 @@ def open_registry(plugins: Sequence[Path], settings: Sequence[Setting] = ()) -> 
     words = [word.strip() for s in by_person for word in str(s.value).split("+")]
     named = [Path(word) for word in words if word.endswith(".py")]
     return load_registry(plugins, named=named, trust=Session.current().trust)
-
-
-def check_origins(toml: TomlSettings, settings: Mapping[str, Setting]) -> None:
-    """Raise SrfError for a Python file that srf.toml names, unless --trust is given: srf.toml may be a stranger's."""
-    from srfcli.laws.registry import untrusted_hint
-
-    for key, setting in settings.items():
-        for word in str(setting.value).split("+"):
-            if word.strip().endswith(".py") and setting.origin == toml.origin and not Session.current().trust:
-                raise SrfError(
-                    f"{toml.origin}: [defaults] {key}: '{word.strip()}' is Python code, which a file may not have run",
-                    untrusted_hint(word.strip()),
-                )
 
 
 def _about(key: str) -> str:
@@ -405,24 +397,18 @@ def read_system(
     """Return what the values of SYSTEM_OPTIONS choose, those that are None by the environment, srf.toml or the default."""
     toml = load_toml(find_toml())
     chosen = {key: choose(key, taken[key], toml=toml) for key in CHOICES}
-    flags = read_flags(taken, assignments)
-    return SystemOptions(chosen, flags=flags, plugins=plugins, toml=toml, effects=effects)
-
-
-# the command gets `system`, a SystemOptions
-system_options = _as_one("system", read_system, SYSTEM_OPTIONS)
-options_with_effects = _as_one("system", read_system, {**SYSTEM_OPTIONS, "effects": EFFECTS_OPTION})
-
-
-def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, str]:
-    """Return what APPARATUS_OPTIONS, among the values `taken`, and --set say, by parameter; raises SrfError for two values."""
     flags: dict[str, str] = {n: taken[f"set_{n}"] for n in APPARATUS_FLAGS if taken[f"set_{n}"] is not None}
     for text in assignments:
         name, value = parse_assignment(text)
         if name in flags and flags[name] != value:
             raise SrfError(f"{name} is set twice: {flags[name]} and {value}", "Give each parameter one value.")
         flags[name] = value
-    return flags
+    return SystemOptions(chosen, flags=flags, plugins=plugins, toml=toml, effects=effects)
+
+
+# the command gets `system`, a SystemOptions
+system_options = _as_one("system", read_system, SYSTEM_OPTIONS)
+options_with_effects = _as_one("system", read_system, {**SYSTEM_OPTIONS, "effects": EFFECTS_OPTION})
 
 
 def value_option(name: str, help: str) -> Callable[[F], F]:
