@@ -530,6 +530,26 @@ def test_a_fit_from_values_30_percent_off_finds_parameters_and_field(make_model,
         assert found.values["field_amplitude"] == pytest.approx(amplitude, rel=0.5)
 
 
+def test_a_fit_of_stick_slip_under_coloured_noise_finds_parameters_and_noise(make_model):
+    """From start values 7 to 25 % off, a wide field that stood for the noise led to parameters that are as far off."""
+    true, off = MICRO.values, {"mu0": 0.32, "A": 0.011, "B": 0.013, "D0": 0.075, "Vsat": 600.0}
+    model = make_model(**MICRO.choice, random_field=True)
+    y = predict(make_model(**MICRO.choice), MICRO.experiment, MICRO.run, true, rtol=1e-9).y
+    rng, lag, sd = np.random.default_rng(8), 0.8, 0.02
+    e = sd * rng.standard_normal(y.size)
+    for k in range(1, y.size):
+        e[k] = lag * e[k - 1] + np.sqrt(1 - lag**2) * e[k]
+    listed = tuple(FitParameter(n, v, v / 5, v * 5, False, "1") for n, v in off.items())
+    run = replace(MICRO.run, observed=y + e)
+    found = fit_state_space(fit_problem(model, replace(MICRO.experiment, parameters=listed, runs=(run,))))
+    errors = dict(zip(found.likelihood.names, np.sqrt(np.diag(found.covariance)), strict=True))
+    for name, value in true.items():
+        assert abs(found.values[name] - value) < 4 * errors[name] < 0.5 * value, name
+    assert found.likelihood.processes == ("relaxation",)
+    assert found.values["gauge_colour1"] == pytest.approx(sd, rel=0.15)
+    assert found.values["gauge_time1"] == pytest.approx(-0.004 / np.log(lag), rel=0.3)
+
+
 def of_stick_slip(make_model, law: str, true: dict[str, float], samples: int) -> Problem:
     """Return the problem of three seconds of stick-slip under a law's true parameters, with noise, on a random field."""
     t = np.linspace(0, 3.0, samples)

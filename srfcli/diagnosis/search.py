@@ -54,6 +54,7 @@ from srfcli.inference.state_space import (
     mass_at_bounds,
     maximise,
     processes_in,
+    relaxations_without_model,
     scan_narrow,
     thinned,
     wide_starts,
@@ -601,15 +602,21 @@ class ModelSearch:
     def _expand_without_field(self, node: Fitted) -> None:
         """Push extensions by scores from a fit without field and colour, where these may have taken up what the model lacks.
 
-        Under a field that no track has, the scores of what is missing are as low as those of what is not. Beside a best model
-        that passes, only effects with a larger score than one of its own.
+        Under a field that no track has, or a colour that no recording shows without a model, the scores of what is
+        missing are as low as those of what is not. Beside a best model that passes, only effects with a larger score than one
+        of its own.
         """
         best = self.best()
         passed = best.passes and best.name != node.name and not best.hypothesis.effects
-        implausible = noise_is_implausible(node.fit) or relative_field_amplitude(node.fit) > WIDE_FIELD_SHARE
+        own = node.fit.likelihood
+        implausible = (
+            noise_is_implausible(node.fit)
+            or relative_field_amplitude(node.fit) > WIDE_FIELD_SHARE
+            or ("relaxation" in own.processes and not any(map(any, relaxations_without_model(own).values())))
+        )
         if len(node.hypothesis.effects) == MAX_EFFECTS or passed or not implausible:
             return
-        smooth = Likelihood(node.fit.likelihood.problem, smooth=True, rtol=SEARCH_RTOL)
+        smooth = Likelihood(own.problem, smooth=True, rtol=SEARCH_RTOL)
         found = maximise(smooth, smooth.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)
         if found.status is Status.INTEGRATION:  # without a field nothing follows the recordings
             return

@@ -61,12 +61,16 @@ Kind: TypeAlias = tuple[str, float, str]  # of gauge noise: an observable, the s
 FILTER_RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING_RTOL_FACTOR = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
-# Fields under which a fit begins: amplitude over friction, length over the longest slip / LENGTHS_IN_SLIP. One after the other,
-# while none leads near a maximum under a faint field
-WIDE_FIELDS = ((0.01, 3.0), (0.01, 10.0), (0.003, 1.0), (0.3, 1.0))
+# Fields under which a fit begins: amplitude over friction, length over the longest slip / LENGTHS_IN_SLIP. First a slow one,
+# which leaves what is fast to the parameters; others where the filter does not follow under it, or it does not become faint
+SLOW_FIELD = (0.01, 3.0)
+FAST_FIELDS = ((0.03, 0.3), (0.1, 3.0), (0.1, 0.3), (0.1, 0.1), (0.3, 1.0))
+FOLLOWED = 4.0  # rms of innovations over their standard deviations, from which on a field does not follow the recordings
+FIELD_STARTS = 2  # of these fields, from which a fit begins at most
 FAINT_FIELD_LENGTHS = (1.0, 0.25, 0.06)  # lengths of faint fields that are tried, over the same
 NOT_CONVERGED = 3.0  # standard errors from its maximum at which a fit is none
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
+MULTI_STARTS = 4  # of these, the likeliest, from which the likelihood is maximised
 LEAST_FIELD = 1e-6  # the least amplitude of a field, over the friction of the recordings
 FAINT_FIELD = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
 FAINT_FIELDS = (0.03, 0.1, 0.3, 1.0)  # amplitudes over FAINT_FIELD, that are tried beside a fit without a field
@@ -424,7 +428,6 @@ class Likelihood:
         self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
         self._last: dict[str, tuple[Array, Filtered]] = {}  # each run as it was filtered last, and where
-        self._friction = max([typical_friction(run) for run in problem.runs], default=0.0)
         scales = _scales(problem.runs) if problem.runs else {}
         self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
         own = dict.fromkeys(kind for run in problem.runs for kind in self.kinds_of(run))
@@ -528,9 +531,7 @@ class Likelihood:
                 gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most, **how,
             )  # fmt: skip
 
-        # a wide field holds the state to the readings, and then their tangents do
-        faint = values["field_amplitude"] < FAINT_FIELD * self._friction
-        found = filtered(linear_move=LINEAR_MOVE if faint else np.inf)
+        found = filtered()
         if not found.whole:  # held back where it cannot be followed otherwise
             found = filtered(farthest=MAX_UPDATE, linear_move=np.inf)
         return replace(found, names=tuple(by) if slopes else ())
@@ -687,7 +688,7 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
     longest = max(float(r.t[-1] - r.t[0]) for r in runs)
     length = max(slid, 1e-6) / LENGTHS_IN_SLIP
     found: dict[Any, tuple[float, float, float]] = {
-        "field_amplitude": (WIDE_FIELDS[0][0] * friction, LEAST_FIELD * friction, 0.3 * friction),
+        "field_amplitude": (SLOW_FIELD[0] * friction, LEAST_FIELD * friction, 0.3 * friction),
         "field_length": (length, length / 100, 10 * length),
     }
     for what in {s.observable for r in runs for s in r.signals}:
@@ -1267,13 +1268,16 @@ class _FitProcedure:
     def from_start(self, start: Mapping[str, float], *, thorough: bool, beside: bool, least: float) -> StateSpaceFit:
         """Return the fit from values by name; see `fit_state_space`."""
         smooth, processes, close, progress = self.smooth, self.processes, self.close, self.progress
-        wide, fresh = self.likelihood(False, processes or ()), "field_amplitude" not in start
+        fresh = "field_amplitude" not in start
+        wide = self.likelihood(False, processes or ())
+        if fresh and processes is None:  # a field that stands for the gauge's colour leads the other parameters astray
+            coloured = wide.beside(self.problem, ("relaxation",))
+            if seen := noise_of_most(coloured):
+                wide, start = self.likelihood(False, coloured.processes), {**start, **seen}
         steps = SCORING_STEPS // 2 if fresh else 12
         found = maximise_from_starts(wide, wide_starts(wide, start, progress), steps, progress)
         if found is None or (fresh and found.status is Status.INTEGRATION):
-            found = maximise_from_starts(
-                wide, multi_start(wide, wide.coordinates(start), progress)[: len(WIDE_FIELDS)], steps, progress
-            )
+            found = maximise_from_starts(wide, multi_start(wide, wide.coordinates(start), progress), steps, progress)
         assert found is not None
         if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
             found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
@@ -1292,6 +1296,8 @@ class _FitProcedure:
         if best.maximum.expected < least:
             return best
         best = self.with_or_without(best)
+        if wide.processes and processes is None:
+            best = with_less_colour(best, close, progress)
         if thorough and processes is None:
             moved = best.smooth or best.log_likelihood > first.log_likelihood + SIGNIFICANT_GAIN
             wider = self.with_colour(best) if moved else best
@@ -1542,7 +1548,7 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
     """
     x = begun.x.copy()
     amplitude = likelihood.names.index("field_amplitude")
-    x[amplitude] = max(x[amplitude], _under_field(likelihood, x, *WIDE_FIELDS[0])[amplitude])
+    x[amplitude] = max(x[amplitude], _under_field(likelihood, x, *SLOW_FIELD)[amplitude])
     point, highest = likelihood.at(x), begun.log_likelihood + SIGNIFICANT_GAIN
     if not np.isfinite(point.log_likelihood):
         return None
@@ -1681,6 +1687,35 @@ def steadily_coloured(found: StateSpaceFit, cautious: bool = False) -> bool:
         return True
     lines = [(kind, at) for kind, (height, at) in _lines(found).items() if height > MAX_DEVIATION]
     return any(not cautious or _visible_without_model(found, kind, at) for kind, at in lines)
+
+
+def relaxations_without_model(likelihood: Likelihood) -> dict[Kind, list[tuple[float, ...]]]:
+    """Return the relaxation in the gauge noise of each run of each kind that shows without a model, as `srf check` has it.
+
+    Correlation time (s), standard deviation, and that of the white noise; empty for a run that shows none.
+    """
+    from srfcli.data.experiment import check_run
+
+    found: dict[Kind, list[tuple[float, ...]]] = {kind: [] for kind in likelihood.kinds}
+    for run in likelihood.problem.runs:
+        noises, spacings = check_run(run).noises, np.array(run.sampling.spacings)
+        for kind in dict.fromkeys(map(likelihood.nearest_kind, likelihood.kinds_of(run))):
+            noise = noises[int(np.argmin(np.abs(np.log(spacings / kind[1]))))]
+            seen = [c for c in noise.colours if len(c) == 2 and run.signals[0].observable == kind[0]]
+            found[kind].append((*seen[0], max(noise.white, 1e-3 * seen[0][1])) if seen else ())
+    return found
+
+
+def noise_of_most(likelihood: Likelihood) -> dict[str, float]:
+    """Return the gauge noise that most runs of each kind show without a model, by name, if it has a relaxation; else nothing."""
+    values: dict[str, float] = {}
+    for kind, runs in relaxations_without_model(likelihood).items():
+        seen = [run for run in runs if run]
+        if 2 * len(seen) <= len(runs):
+            return {}
+        names, middle = likelihood.gauge_names(kind), np.exp(np.median(np.log(np.array(seen)), axis=0))
+        values |= {names[n]: float(v) for n, v in zip((*gauge_rows(["relaxation"])[0], "gauge_white"), middle, strict=True)}
+    return values
 
 
 def _lines(found: StateSpaceFit) -> dict[Kind, tuple[float, float]]:
@@ -1837,28 +1872,36 @@ def _amplitude(field_likelihood: Likelihood, share: float) -> float:
 
 
 def wide_starts(field_likelihood: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Iterator[Array]:
-    """Yield x at `start` under one wide field after the other, where the filter stays with the recordings."""
+    """Yield x at `start` under a slow field, if the filter then stays with the recordings, and under the likeliest of others."""
     x = field_likelihood.coordinates(start)
     if "field_amplitude" in start:
         yield x
         return
     amplitude, length = (field_likelihood.names.index(n) for n in FIELD)
-    for wide, long in WIDE_FIELDS:
-        trial = field_likelihood.at(_under_field(field_likelihood, x, wide, long), slopes=False)
-        field = f"field of {np.exp(trial.x[amplitude]):.2g} over {np.exp(trial.x[length]):.2g} um"
-        progress(f"{field}: log likelihood {trial.log_likelihood:.1f}")
-        if np.isfinite(trial.log_likelihood):
-            yield trial.x
+
+    def begun(wide: float, long: float) -> Point:
+        point = field_likelihood.at(_under_field(field_likelihood, x, wide, long), slopes=False)
+        field = f"field of {np.exp(point.x[amplitude]):.2g} over {np.exp(point.x[length]):.2g} um"
+        progress(f"{field}: log likelihood {point.log_likelihood:.1f}")
+        return point
+
+    slow = begun(*SLOW_FIELD)
+    followed = bool(np.isfinite(slow.log_likelihood)) and slow.rms < FOLLOWED
+    if followed:
+        yield slow.x
+    others = [*(begun(*field) for field in FAST_FIELDS), *([] if followed else [slow])]
+    others.sort(key=lambda point: -point.log_likelihood)
+    yield from [point.x for point in others if np.isfinite(point.log_likelihood)][: FIELD_STARTS - followed]
 
 
 def multi_start(field_likelihood: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
-    """Return SOBOL_STARTS starts over the bounds, mu0 that of the recordings, under wide fields in turn, the likeliest first.
+    """Return SOBOL_STARTS starts over the bounds, mu0 that of the recordings, under fields in turn, the MULTI_STARTS likeliest.
 
     A model that slips without end at the file's start values, as one without inertia may, is followed from others.
     """
     from scipy.stats import qmc
 
-    k = len(field_likelihood.problem.names)
+    k, fields = len(field_likelihood.problem.names), (SLOW_FIELD, *FAST_FIELDS)
     levels = [i for i, n in enumerate(field_likelihood.problem.names) if n.partition("[")[0] == "mu0"]
     seen = float(np.median([typical_friction(run) for run in field_likelihood.problem.runs]))
     trials: list[tuple[float, Array]] = []
@@ -1867,12 +1910,12 @@ def multi_start(field_likelihood: Likelihood, x: Array, progress: Callable[[str]
         trial[:k] = field_likelihood.lower[:k] + share * (field_likelihood.upper - field_likelihood.lower)[:k]
         trial[levels] = np.where(field_likelihood.logarithmic[levels], np.log(seen), seen)
         trial = np.clip(trial, field_likelihood.lower, field_likelihood.upper)
-        trial = _under_field(field_likelihood, trial, *WIDE_FIELDS[number % len(WIDE_FIELDS)])
+        trial = _under_field(field_likelihood, trial, *fields[number % len(fields)])
         found = field_likelihood.at(trial, slopes=False).log_likelihood
         progress(f"from another start: log likelihood {found:.1f}")
         if np.isfinite(found):
             trials.append((found, trial))
-    return [trial for _, trial in sorted(trials, key=lambda t: -t[0])] or [x]
+    return [trial for _, trial in sorted(trials, key=lambda t: -t[0])[:MULTI_STARTS]] or [x]
 
 
 def as_fit(found: StateSpaceFit) -> Fit:
