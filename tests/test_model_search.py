@@ -123,8 +123,8 @@ def test_a_friction_of_each_runs_own_is_no_missing_physics(tmp_path):
     assert 0.8 < np.sqrt(np.mean(white**2)) < 1.2
 
 
-def test_what_is_missing_is_named_on_rough_tracks(ageing):
-    found = said(ageing)
+def test_what_is_missing_is_named_on_rough_tracks(ageing, begun):
+    found = said(ageing, by=begun)
     assert (found.verdict, found.effects) == ("identified", ("linker-dieterich",))
     best = found.best.fit
     error = np.sqrt(np.diag(best.maximum.covariance))[best.likelihood.names.index("alpha")]

@@ -7,6 +7,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +38,9 @@ def steps() -> dict[str, np.ndarray]:
     mu, theta = TRUE["mu0"], TRUE["D0"] / 1.0
     seen = np.empty(t.size)
     for i in range(t.size):
-        v = TRUE["V0"] * np.exp((mu - TRUE["mu0"] - TRUE["B"] * np.log(TRUE["V0"] * theta / TRUE["D0"])) / TRUE["A"])
+        v = TRUE["V0"] * math.exp((mu - TRUE["mu0"] - TRUE["B"] * math.log(TRUE["V0"] * theta / TRUE["D0"])) / TRUE["A"])
         seen[i] = mu
-        mu += dt * k * (V[i] - v)
+        mu += dt * k * (V[i].item() - v)
         theta += dt * (1 - v * theta / TRUE["D0"])
     part = slice(None, None, 500)  # 10 Hz
     friction = seen[part] + rng.normal(0.0, 1e-4, seen[part].size)
@@ -207,6 +208,7 @@ def test_a_stiffness_per_load_is_never_rescaled_in_silence(step: dict[str, np.nd
     assert "counts for each run" not in srf("check", ".", "--no-simulate").stdout
 
 
+@cache
 def to_and_fro(
     *, strokes: int, K: float = 4e-4, W: float = 0.02, D0: float = 4.0, V: float = 5.0, play: float = 0.0, rate: int = 20
 ) -> np.ndarray:
