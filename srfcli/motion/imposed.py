@@ -557,14 +557,8 @@ class LoadSteps(Load):
     def piece(self, t: float) -> LoadPiece:
         i = bisect_right(self.breaks, t)
         knot = self.breaks[i - 1] if i else t
-        a, b, c, d, e, f, g = self._expanded(knot, self._inside(i)).tolist()
-
-        def polynomial(s: float) -> tuple[float, float]:
-            h = s - knot
-            W = a + h * (b + h * (c + h * (d + h * (e + h * (f + h * g)))))
-            return W, b + h * (2 * c + h * (3 * d + h * (4 * e + h * (5 * f + h * 6 * g))))
-
-        return polynomial
+        coefficients = self._expanded(knot, self._inside(i)).tolist()
+        return lambda s: _horner(coefficients, s - knot)
 
     def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
         """Return knots (k + 1,) and coefficients (k, 7), lowest power first in t - knots[i]: W on [start, end], exactly."""
