@@ -2,12 +2,11 @@
 
     python benchmarks/start_fields.py TRIAL [TRIAL ...]
 
-TRIAL is a folder of `srf prove`, unsealed. Of each case whose physics is registered the right model is fitted as
-`fit_state_space` begins, with the coloured noise that recordings show by themselves: half of the scoring steps under each field,
-then as many again where that is no maximum yet. Ending within NEAR of the likeliest counts as reached. `the likeliest of these`
-begins under the field that is likeliest at the start values; `as a fit` is what a fit does: under SLOW_FIELD if the filter then
-follows the recordings, and where that does not lead near a maximum under a narrower field, under the likeliest of FAST_FIELDS.
-`four in turn` are the fields of earlier programs, one after the other.
+TRIAL is a folder of `srf prove`, unsealed. Of each case whose physics is registered the right model is fitted with white noise,
+as `fit_state_space` begins: half of the scoring steps under each field, then as many again where that is no maximum yet. Ending
+within NEAR of the likeliest counts as reached. `the likeliest of these` begins under the field that is likeliest at the start
+values; `the first few in turn` is what a fit does: one field of WIDE_FIELDS after the other, until one leads near a maximum under
+a field that is narrower than at the start.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
-from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -26,69 +24,43 @@ from at_the_truth import right_problem
 from common import Report
 
 from srfcli.core.errors import SrfError
-from srfcli.inference.state_space import (
-    FAST_FIELDS,
-    FIELD,
-    FIELD_STARTS,
-    FOLLOWED,
-    NOT_CONVERGED,
-    SCORING_STEPS,
-    SLOW_FIELD,
-    Likelihood,
-    maximise,
-    noise_of_most,
-)
+from srfcli.inference.state_space import FIELD, NOT_CONVERGED, SCORING_STEPS, WIDE_FIELDS, Likelihood, maximise
 from srfcli.validation.cases import unseal
 
-IN_TURN = (SLOW_FIELD, (0.01, 10.0), (0.003, 1.0), (0.3, 1.0))
-FIELDS = tuple(dict.fromkeys((SLOW_FIELD, *FAST_FIELDS, *IN_TURN)))
+FIELDS = (*WIDE_FIELDS, (0.03, 1.0), (0.03, 3.0), (0.02, 10.0), (0.01, 1.0), (0.003, 3.0), (0.003, 0.25))
 NEAR = 3.0  # in log likelihood
 RTOL = 1e-3  # of the integration, as in a search
-Found = dict[tuple[float, float], tuple[float, float, float, bool, bool]]
+Found = dict[tuple[float, float], tuple[float, float, float, bool]]
 
 
 def tried(case: tuple[Path, dict[str, Any]]) -> Found | str:
-    """Return by field, or a reason for none: log likelihood at the start and where it ends, CPU, if it shrank, if followed."""
+    """Return by field: log likelihood at the start and where it ends, CPU, whether its field has shrunk; a reason for none."""
     folder, concealed = case
     try:
-        problem = right_problem(folder, concealed)[2]
+        likelihood = Likelihood(right_problem(folder, concealed)[2], rtol=RTOL)
     except SrfError as error:
         return str(error)
-    likelihood = Likelihood(problem, processes=("relaxation",), rtol=RTOL)
-    noise = noise_of_most(likelihood)
-    likelihood = likelihood if noise else Likelihood(problem, rtol=RTOL)
     at = [likelihood.names.index(n) for n in FIELD]
     found = {}
     for wide, long in FIELDS:
-        x, since = likelihood.coordinates(noise), time.process_time()
-        x[at] += np.log([wide / SLOW_FIELD[0], long])
-        begun = likelihood.at(x, slopes=False)
-        height, reached, shrunk = begun.log_likelihood, -np.inf, False
+        x, since = likelihood.start.copy(), time.process_time()
+        x[at] += np.log([wide / WIDE_FIELDS[0][0], long])
+        height, reached, shrunk = likelihood.at(x, slopes=False).log_likelihood, -np.inf, False
         if np.isfinite(height):
             best = maximise(likelihood, x, steps=SCORING_STEPS // 2, close=1.0)
             if best.away >= 1.0 and np.isfinite(best.point.log_likelihood):
                 best = maximise(likelihood, best.point.x, steps=SCORING_STEPS // 2, close=1.0)
             reached = best.point.log_likelihood
             shrunk = best.away < NOT_CONVERGED and bool(best.point.x[at[0]] < x[at[0]])
-        followed = bool(np.isfinite(height)) and begun.rms < FOLLOWED
-        found[wide, long] = height, reached, time.process_time() - since, shrunk, followed
+        found[wide, long] = height, reached, time.process_time() - since, shrunk
     return found
 
 
 def chosen(found: Found) -> dict[str, list[tuple[float, float]]]:
     """Return the fields under which each way of beginning a fit goes on."""
-
-    def until_shrunk(fields: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        tries = [f for f in fields if np.isfinite(found[f][0])]
-        return next((tries[: i + 1] for i, f in enumerate(tries) if found[f][3]), tries)
-
-    first = [SLOW_FIELD] if found[SLOW_FIELD][4] else []
-    others = sorted({SLOW_FIELD, *FAST_FIELDS} - set(first), key=lambda f: -found[f][0])
-    ways = {
-        "the likeliest of these": [max(found, key=lambda f: found[f][0])],
-        "as a fit": until_shrunk([*first, *others][:FIELD_STARTS]),
-        "four in turn": until_shrunk(IN_TURN),
-    }
+    tries = [f for f in WIDE_FIELDS if np.isfinite(found[f][0])]
+    few = next((tries[: i + 1] for i, f in enumerate(tries) if found[f][3]), tries)
+    ways = {"the likeliest of these": [max(found, key=lambda f: found[f][0])], "the first few in turn, as a fit": few}
     return ways | {f"{wide:g} over {long:g}": [(wide, long)] for wide, long in FIELDS}
 
 

@@ -7,7 +7,7 @@ that act by a load that changes have none there; their cases are drawn anew. `se
 answers it, and `srf prove --report-only FOLDER` marks it.
 
 With `--limits` the truths are read, and the right model of each case is fitted from the file's start values and from others, A,
-B and D0 off by a quarter at random: the first steps of a fit, under the fields from which a fit begins. Each
+B and D0 off by a quarter at random: the first steps of a fit, under one wide field after the other, as a fit chooses them. Each
 limit takes the place of MAX_UPDATE, inf is none. Reached is what ends within NEAR of the likeliest maximum
 that any of these finds.
 """

@@ -545,7 +545,7 @@ def test_a_fit_of_stick_slip_under_coloured_noise_finds_parameters_and_noise(mak
     errors = dict(zip(found.likelihood.names, np.sqrt(np.diag(found.covariance)), strict=True))
     for name in ("mu0", "A", "B", "D0"):
         assert abs(found.values[name] - true[name]) < 4 * errors[name], name
-    assert errors["mu0"] < 0.02 and errors["A"] < 0.15 * true["A"]
+    assert errors["mu0"] < 0.05 and errors["A"] < 0.2 * true["A"]
     assert found.likelihood.processes == ("relaxation",)
     assert found.values["gauge_colour1"] == pytest.approx(sd, rel=0.15)
     assert found.values["gauge_time1"] == pytest.approx(-0.004 / np.log(lag), rel=0.3)

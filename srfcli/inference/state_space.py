@@ -61,12 +61,11 @@ Kind: TypeAlias = tuple[str, float, str]  # of gauge noise: an observable, the s
 FILTER_RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING_RTOL_FACTOR = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
-# Fields under which a fit begins: amplitude over friction, length over the longest slip / LENGTHS_IN_SLIP. First a slow one,
-# which leaves what is fast to the parameters; others where the filter does not follow under it, or it does not become faint
-SLOW_FIELD = (0.01, 3.0)
-FAST_FIELDS = ((0.03, 0.3), (0.1, 3.0), (0.1, 0.3), (0.1, 0.1), (0.3, 1.0))
+# Fields under which a fit begins: amplitude over friction, length over the longest slip / LENGTHS_IN_SLIP. One after the other,
+# while none leads near a maximum under a faint field
+WIDE_FIELDS = ((0.01, 3.0), (0.01, 10.0), (0.003, 1.0), (0.3, 1.0))
+FAST_FIELDS = ((0.03, 0.3), (0.1, 3.0), (0.1, 0.3), (0.1, 0.1), (0.3, 1.0))  # before, where the first does not follow
 FOLLOWED = 4.0  # rms of innovations over their standard deviations, from which on a field does not follow the recordings
-FIELD_STARTS = 2  # of these fields, from which a fit begins at most
 FAINT_FIELD_LENGTHS = (1.0, 0.25, 0.06)  # lengths of faint fields that are tried, over the same
 NOT_CONVERGED = 3.0  # standard errors from its maximum at which a fit is none
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
@@ -428,6 +427,7 @@ class Likelihood:
         self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
         self._last: dict[str, tuple[Array, Filtered]] = {}  # each run as it was filtered last, and where
+        self._friction = max([typical_friction(run) for run in problem.runs], default=0.0)
         scales = _scales(problem.runs) if problem.runs else {}
         self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
         own = dict.fromkeys(kind for run in problem.runs for kind in self.kinds_of(run))
@@ -531,7 +531,9 @@ class Likelihood:
                 gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most, **how,
             )  # fmt: skip
 
-        found = filtered()
+        # a wide field holds the state to the readings, and then their tangents do
+        faint = values["field_amplitude"] < FAINT_FIELD * self._friction
+        found = filtered(linear_move=LINEAR_MOVE if faint else np.inf)
         if not found.whole:  # held back where it cannot be followed otherwise
             found = filtered(farthest=MAX_UPDATE, linear_move=np.inf)
         return replace(found, names=tuple(by) if slopes else ())
@@ -688,7 +690,7 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
     longest = max(float(r.t[-1] - r.t[0]) for r in runs)
     length = max(slid, 1e-6) / LENGTHS_IN_SLIP
     found: dict[Any, tuple[float, float, float]] = {
-        "field_amplitude": (SLOW_FIELD[0] * friction, LEAST_FIELD * friction, 0.3 * friction),
+        "field_amplitude": (WIDE_FIELDS[0][0] * friction, LEAST_FIELD * friction, 0.3 * friction),
         "field_length": (length, length / 100, 10 * length),
     }
     for what in {s.observable for r in runs for s in r.signals}:
@@ -1548,7 +1550,7 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
     """
     x = begun.x.copy()
     amplitude = likelihood.names.index("field_amplitude")
-    x[amplitude] = max(x[amplitude], _under_field(likelihood, x, *SLOW_FIELD)[amplitude])
+    x[amplitude] = max(x[amplitude], _under_field(likelihood, x, *WIDE_FIELDS[0])[amplitude])
     point, highest = likelihood.at(x), begun.log_likelihood + SIGNIFICANT_GAIN
     if not np.isfinite(point.log_likelihood):
         return None
@@ -1872,7 +1874,7 @@ def _amplitude(field_likelihood: Likelihood, share: float) -> float:
 
 
 def wide_starts(field_likelihood: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Iterator[Array]:
-    """Yield x at `start` under a slow field, if the filter then stays with the recordings, and under the likeliest of others."""
+    """Yield x at `start` under one wide field after the other; where the first does not follow, the likeliest of FAST_FIELDS."""
     x = field_likelihood.coordinates(start)
     if "field_amplitude" in start:
         yield x
@@ -1885,13 +1887,14 @@ def wide_starts(field_likelihood: Likelihood, start: Mapping[str, float], progre
         progress(f"{field}: log likelihood {point.log_likelihood:.1f}")
         return point
 
-    slow = begun(*SLOW_FIELD)
-    followed = bool(np.isfinite(slow.log_likelihood)) and slow.rms < FOLLOWED
-    if followed:
-        yield slow.x
-    others = [*(begun(*field) for field in FAST_FIELDS), *([] if followed else [slow])]
-    others.sort(key=lambda point: -point.log_likelihood)
-    yield from [point.x for point in others if np.isfinite(point.log_likelihood)][: FIELD_STARTS - followed]
+    first = begun(*WIDE_FIELDS[0])
+    if not np.isfinite(first.log_likelihood) or first.rms > FOLLOWED:
+        fastest = max((begun(*fast) for fast in FAST_FIELDS), key=lambda point: point.log_likelihood)
+        if np.isfinite(fastest.log_likelihood):
+            yield fastest.x
+    for point in (first, *(begun(*wide) for wide in WIDE_FIELDS[1:])):
+        if np.isfinite(point.log_likelihood):
+            yield point.x
 
 
 def multi_start(field_likelihood: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
@@ -1901,7 +1904,7 @@ def multi_start(field_likelihood: Likelihood, x: Array, progress: Callable[[str]
     """
     from scipy.stats import qmc
 
-    k, fields = len(field_likelihood.problem.names), (SLOW_FIELD, *FAST_FIELDS)
+    k = len(field_likelihood.problem.names)
     levels = [i for i, n in enumerate(field_likelihood.problem.names) if n.partition("[")[0] == "mu0"]
     seen = float(np.median([typical_friction(run) for run in field_likelihood.problem.runs]))
     trials: list[tuple[float, Array]] = []
@@ -1910,7 +1913,7 @@ def multi_start(field_likelihood: Likelihood, x: Array, progress: Callable[[str]
         trial[:k] = field_likelihood.lower[:k] + share * (field_likelihood.upper - field_likelihood.lower)[:k]
         trial[levels] = np.where(field_likelihood.logarithmic[levels], np.log(seen), seen)
         trial = np.clip(trial, field_likelihood.lower, field_likelihood.upper)
-        trial = _under_field(field_likelihood, trial, *fields[number % len(fields)])
+        trial = _under_field(field_likelihood, trial, *WIDE_FIELDS[number % len(WIDE_FIELDS)])
         found = field_likelihood.at(trial, slopes=False).log_likelihood
         progress(f"from another start: log likelihood {found:.1f}")
         if np.isfinite(found):

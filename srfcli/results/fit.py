@@ -22,7 +22,7 @@ from srfcli.inference.fit import Fit, RunFit
 from srfcli.inference.noise import lag_one
 from srfcli.inference.posterior import Posterior, not_quadratic
 from srfcli.inference.profile import MAX_INTERVAL_RATIO, Interval
-from srfcli.inference.state_space import SLOW_FIELD, typical_friction
+from srfcli.inference.state_space import WIDE_FIELDS, typical_friction
 from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
 from srfcli.results import plots
 from srfcli.results.figures import draw_loads, stacked
@@ -352,7 +352,7 @@ class FitResult(Result):
 
             own, uneven, coarse = (told_of(found.state_space) for told_of in (own_levels, uneven_noise, coarse_readings))
         notes += own
-        if self._field_share > SLOW_FIELD[0] and not own:
+        if self._field_share > WIDE_FIELDS[0][0] and not own:
             notes.append(
                 "under so wide a field a recording is followed whatever the parameters are, and the maximum may be a wrong one: "
                 "try --starts 5, or start values nearer to what is known"
