@@ -327,7 +327,6 @@ def test_words_and_numbers_agree(diagnosis: Diagnosis, found: DiscriminatingRun)
 
 
 @pytest.mark.usefixtures("without_matplotlib")
-@pytest.mark.usefixtures("without_matplotlib")
 def test_what_is_written_says_it(folder: Path, result: DiagnosisResult, found: DiscriminatingRun) -> None:
     """The answer has the experiment; what each hypothesis predicts is an experiment that `srf simulate` repeats."""
     out = folder.parent / "found"

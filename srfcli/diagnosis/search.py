@@ -606,15 +606,16 @@ class ModelSearch:
         missing are as low as those of what is not. Beside a best model that passes, only effects with a larger score than one
         of its own.
         """
-        best = self.best()
-        passed = best.passes and best.name != node.name and not best.hypothesis.effects
-        own = node.fit.likelihood
-        implausible = (
+        best, own = self.best(), node.fit.likelihood
+        if len(node.hypothesis.effects) == MAX_EFFECTS or (
+            best.passes and best.name != node.name and not best.hypothesis.effects
+        ):
+            return
+        if not (
             noise_is_implausible(node.fit)
             or relative_field_amplitude(node.fit) > WIDE_FIELD_SHARE
             or ("relaxation" in own.processes and not any(map(any, relaxations_without_model(own).values())))
-        )
-        if len(node.hypothesis.effects) == MAX_EFFECTS or passed or not implausible:
+        ):
             return
         smooth = Likelihood(own.problem, smooth=True, rtol=SEARCH_RTOL)
         found = maximise(smooth, smooth.coordinates(node.fit.values), steps=TRIAL_STEPS, close=1.0, progress=self.progress)

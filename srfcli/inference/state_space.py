@@ -17,7 +17,7 @@ import os
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
@@ -69,7 +69,6 @@ FOLLOWED = 4.0  # rms of innovations over their standard deviations, from which 
 FAINT_FIELD_LENGTHS = (1.0, 0.25, 0.06)  # lengths of faint fields that are tried, over the same
 NOT_CONVERGED = 3.0  # standard errors from its maximum at which a fit is none
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
-MULTI_STARTS = 4  # of these, the likeliest, from which the likelihood is maximised
 LEAST_FIELD = 1e-6  # the least amplitude of a field, over the friction of the recordings
 FAINT_FIELD = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
 FAINT_FIELDS = (0.03, 0.1, 0.3, 1.0)  # amplitudes over FAINT_FIELD, that are tried beside a fit without a field
@@ -1272,14 +1271,15 @@ class _FitProcedure:
         smooth, processes, close, progress = self.smooth, self.processes, self.close, self.progress
         fresh = "field_amplitude" not in start
         wide = self.likelihood(False, processes or ())
-        if fresh and processes is None:  # a field that stands for the gauge's colour leads the other parameters astray
-            coloured = wide.beside(self.problem, ("relaxation",))
-            if seen := noise_of_most(coloured):
-                wide, start = self.likelihood(False, coloured.processes), {**start, **seen}
+        # a field that stands for the gauge's colour leads the other parameters astray
+        if fresh and processes is None and (seen := noise_of_most(wide)):
+            wide, start = self.likelihood(False, ("relaxation",)), {**start, **seen}
         steps = SCORING_STEPS // 2 if fresh else 12
         found = maximise_from_starts(wide, wide_starts(wide, start, progress), steps, progress)
         if found is None or (fresh and found.status is Status.INTEGRATION):
-            found = maximise_from_starts(wide, multi_start(wide, wide.coordinates(start), progress), steps, progress)
+            found = maximise_from_starts(
+                wide, multi_start(wide, wide.coordinates(start), progress)[: len(WIDE_FIELDS)], steps, progress
+            )
         assert found is not None
         if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
             found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
@@ -1710,14 +1710,15 @@ def relaxations_without_model(likelihood: Likelihood) -> dict[Kind, list[tuple[f
 
 def noise_of_most(likelihood: Likelihood) -> dict[str, float]:
     """Return the gauge noise that most runs of each kind show without a model, by name, if it has a relaxation; else nothing."""
-    values: dict[str, float] = {}
+    found = {}
     for kind, runs in relaxations_without_model(likelihood).items():
         seen = [run for run in runs if run]
         if 2 * len(seen) <= len(runs):
             return {}
-        names, middle = likelihood.gauge_names(kind), np.exp(np.median(np.log(np.array(seen)), axis=0))
-        values |= {names[n]: float(v) for n, v in zip((*gauge_rows(["relaxation"])[0], "gauge_white"), middle, strict=True)}
-    return values
+        found[kind] = np.exp(np.median(np.log(np.array(seen)), axis=0)).tolist()
+    coloured = likelihood.beside(likelihood.problem, ("relaxation",))
+    order = (*gauge_rows(coloured.processes)[0], "gauge_white")
+    return {coloured.gauge_names(kind)[n]: v for kind, own in found.items() for n, v in zip(order, own, strict=True)}
 
 
 def _lines(found: StateSpaceFit) -> dict[Kind, tuple[float, float]]:
@@ -1881,24 +1882,23 @@ def wide_starts(field_likelihood: Likelihood, start: Mapping[str, float], progre
         return
     amplitude, length = (field_likelihood.names.index(n) for n in FIELD)
 
+    @cache
     def begun(wide: float, long: float) -> Point:
         point = field_likelihood.at(_under_field(field_likelihood, x, wide, long), slopes=False)
         field = f"field of {np.exp(point.x[amplitude]):.2g} over {np.exp(point.x[length]):.2g} um"
         progress(f"{field}: log likelihood {point.log_likelihood:.1f}")
         return point
 
-    first = begun(*WIDE_FIELDS[0])
+    first, fields = begun(*WIDE_FIELDS[0]), list(WIDE_FIELDS)
     if not np.isfinite(first.log_likelihood) or first.rms > FOLLOWED:
-        fastest = max((begun(*fast) for fast in FAST_FIELDS), key=lambda point: point.log_likelihood)
-        if np.isfinite(fastest.log_likelihood):
-            yield fastest.x
-    for point in (first, *(begun(*wide) for wide in WIDE_FIELDS[1:])):
+        fields.insert(0, max(FAST_FIELDS, key=lambda fast: begun(*fast).log_likelihood))
+    for point in (begun(*wide) for wide in dict.fromkeys(fields)):
         if np.isfinite(point.log_likelihood):
             yield point.x
 
 
 def multi_start(field_likelihood: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
-    """Return SOBOL_STARTS starts over the bounds, mu0 that of the recordings, under fields in turn, the MULTI_STARTS likeliest.
+    """Return SOBOL_STARTS starts over the bounds, mu0 that of the recordings, under wide fields in turn, the likeliest first.
 
     A model that slips without end at the file's start values, as one without inertia may, is followed from others.
     """
@@ -1918,7 +1918,7 @@ def multi_start(field_likelihood: Likelihood, x: Array, progress: Callable[[str]
         progress(f"from another start: log likelihood {found:.1f}")
         if np.isfinite(found):
             trials.append((found, trial))
-    return [trial for _, trial in sorted(trials, key=lambda t: -t[0])[:MULTI_STARTS]] or [x]
+    return [trial for _, trial in sorted(trials, key=lambda t: -t[0])] or [x]
 
 
 def as_fit(found: StateSpaceFit) -> Fit:
