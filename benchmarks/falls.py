@@ -18,7 +18,7 @@ from common import Report
 
 from srfcli.codegen.model import open_model
 from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
-from srfcli.inference.kalman import LINEAR_MOVE
+from srfcli.inference import kalman
 from srfcli.inference.prediction import predict
 from srfcli.inference.state_space import MAX_UPDATE, filter_run
 from srfcli.laws.registry import bundled_registry
@@ -28,6 +28,7 @@ VALUES = {"mu0": 0.3, "A": 0.0093, "B": 0.016, "D0": 0.09, "Vsat": 800.0}
 STIFFNESS, MASS, SD = 0.004, 1e-9, 0.01  # N/um, N s^2/um, um
 SHIFTS, AMPLITUDES = (0.0, 2e-4), (1e-5, 1e-4, 3e-4, 1e-3)
 FAR_LONGER = 1e7  # um
+LINEAR_MOVE = kalman.LINEAR_MOVE  # with it the equations are linearised again, without an end to it once
 POINTS = 241  # of the quadrature
 RTOL = 1e-7
 
@@ -54,9 +55,12 @@ def main() -> None:
         y = predict(model, experiment, run, VALUES | {"mu0": there}, rtol=1e-10).y
         read = replace(run, observed=y + SD * np.random.default_rng(1).standard_normal(y.size))
 
-        def height(mu0: float, a: float, read: Run = read, **how: float) -> float:
+        def height(
+            mu0: float, a: float, read: Run = read, *, linear_move: float = LINEAR_MOVE, farthest: float = np.inf
+        ) -> float:
+            kalman.LINEAR_MOVE = linear_move
             values = VALUES | {"mu0": mu0, "field_amplitude": a, "field_length": FAR_LONGER, "gauge_white": SD}
-            found = filter_run(model, experiment, read, values, rtol=RTOL, **how)
+            found = filter_run(model, experiment, read, values, rtol=RTOL, farthest=farthest)
             return found.log_likelihood
 
         width = 1e-9
@@ -67,7 +71,7 @@ def main() -> None:
         for a in AMPLITUDES:
             prior = np.exp(-0.5 * ((grid - VALUES["mu0"]) / a) ** 2) / (a * np.sqrt(2 * np.pi))
             exact = heights.max() + np.log(np.sum(np.exp(heights - heights.max()) * prior) * (grid[1] - grid[0]))
-            again, once = height(VALUES["mu0"], a, linear_move=LINEAR_MOVE), height(VALUES["mu0"], a, linear_move=np.inf)
+            again, once = height(VALUES["mu0"], a), height(VALUES["mu0"], a, linear_move=np.inf)
             if not np.isfinite(once):
                 once = height(VALUES["mu0"], a, linear_move=np.inf, farthest=MAX_UPDATE)
             rows.append((f"{shift:g}", f"{a:g}", f"{exact:.2f}", f"{again:.2f}", f"{once:.2f}"))

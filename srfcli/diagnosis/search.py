@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any, ClassVar
 
 import numpy as np
@@ -50,6 +51,7 @@ from srfcli.inference.state_space import (
     StateSpaceFit,
     fit_state_space,
     likeliest_along_ridges,
+    likeliest_end,
     log_evidence,
     mass_at_bounds,
     maximise,
@@ -166,6 +168,7 @@ class _Trial:
     beside: Likelihood
     own: Likelihood
     found: Maximum
+    starts: Iterator[Array]
 
 
 class _BudgetSpent(Exception):
@@ -841,11 +844,12 @@ class ModelSearch:
         if beside is None:
             return None
         own = Likelihood(self._problem(hypothesis, {}), rtol=SEARCH_RTOL)
-        start = next(wide_starts(own, {}, self.progress), None)
+        starts = wide_starts(own, {}, self.progress)
+        start = next(starts, None)
         if start is None:
             return None
         found = maximise(own, start, steps=TRIAL_STEPS, close=1.0, progress=self.progress)
-        return _Trial(hypothesis, beside, own, found)
+        return _Trial(hypothesis, beside, own, found, starts)
 
     def _with_a_second(self, trial: _Trial) -> _Trial | None:
         """Return the likeliest model of one effect more, begun from the start values of the file; None if none is far likelier.
@@ -874,6 +878,9 @@ class ModelSearch:
         """
         hypothesis, beside, own, found = trial.hypothesis, trial.beside, trial.own, trial.found
         self._finished.add(hypothesis.name)
+        if noise_is_implausible(StateSpaceFit(own, found)):  # one wide field may lead where another does not
+            ends = (maximise(own, x, steps=TRIAL_STEPS, close=1.0, progress=self.progress) for x in trial.starts)
+            found = likeliest_end(own, chain([found], ends)) or found
         places = [near] if hypothesis.ageing and (near := self._maximum_near_parents(hypothesis, beside)) else []
         if found.away > 1.0 and found.point.log_likelihood > highest - PRUNING_DEFICIT:
             found = maximise(own, found.point.x, close=1.0, progress=self.progress)

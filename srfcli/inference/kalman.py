@@ -120,7 +120,6 @@ def kalman_filter(
     keep: bool,
     most: int | None,
     farthest: float,
-    linear_move: float = LINEAR_MOVE,
 ) -> Innovations:
     """Return the innovations of the readings.
 
@@ -131,7 +130,7 @@ def kalman_filter(
     numbers in the same k directions. A reading moves ln v and ln PHI by no more than `farthest`, and the field by as many of its
     standard deviations, as what it says of them is linear: beside the fall of a stick-slip cycle that may be a velocity of any
     size, which cannot be followed. Each reading is still predicted from those before it alone, so that the likelihood is one.
-    Where one moves them by more than `linear_move`, and what it then shows is not on its tangent, the equations are linearised
+    Where one moves them by more than LINEAR_MOVE, and what it then shows is not on its tangent, the equations are linearised
     again.
     After `most` steps, 50 a sample if that is None, the rest is NaN. Raises SrfError without a compiler, or for a model without a
     random friction field.
@@ -151,7 +150,7 @@ def kalman_filter(
     nu_d, S_d = np.full((n, k), np.nan), np.full((n, k), np.nan)
     shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide), (n, wide)) if keep else ((1,),) * 5
     arrays = [np.full(shape, np.nan) for shape in shapes]
-    logarithm, linear = integers(np.char.startswith(model.states, "ln_")), doubles(np.array([linear_move, NONLINEARITY]))
+    logarithm, linear = integers(np.char.startswith(model.states, "ln_")), doubles(np.array([LINEAR_MOVE, NONLINEARITY]))
     stats, stop, reached = np.zeros(4), ctypes.c_int(0), n
     imposed, use = imposed_arguments(read.t, drive, load), np.ascontiguousarray(read.used, dtype=np.uint8)
     size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000) if most is None else most

@@ -32,18 +32,7 @@ from srfcli.data.noise import calm_level, carried
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import Fit, Problem, RunFit, inverse
-from srfcli.inference.kalman import (
-    GAUGE,
-    LINEAR_MOVE,
-    SPRING,
-    Dual,
-    Innovations,
-    Readings,
-    Smoothed,
-    SmootherInput,
-    kalman_filter,
-    smooth,
-)
+from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Readings, Smoothed, SmootherInput, kalman_filter, smooth
 from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
     basis,
@@ -265,7 +254,6 @@ def filter_run(
     keep: bool = False,
     most: int | None = None,
     farthest: float = np.inf,
-    linear_move: float = LINEAR_MOVE,
 ) -> Filtered:
     """Return `run` filtered under `values` (um, s, N), with derivatives by the parameters `by`.
 
@@ -274,8 +262,7 @@ def filter_run(
     exponentially or `gauge_frequency1` (Hz) and `gauge_quality1` if it is an oscillator's, and so on up to 3 of these, and what
     belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. `gauges` say by which names they have those of the gauge: for each
     signal, one after the other, one for each of the run's sampling rates. After `most` steps it is given up. `farthest` is how
-    far a reading may move the state, and `linear_move` how far before the equations are linearised again, as `kalman_filter` has
-    them.
+    far a reading may move the state, as `kalman_filter` has it.
     """
     k, c, rates = len(by), len(run.signals), len(run.sampling.spacings)
     p = run_parameters(model, experiment, run, values)
@@ -298,7 +285,6 @@ def filter_run(
         gauge=Dual(gauge[0].reshape(rates, -1, 3), gauge[1].reshape(rates, c * len(rows), 3, k)),
         order=[len(row) - 1 for row in rows] * c, owner=np.repeat(np.arange(c), len(rows)).tolist(),
         rtol=rtol, atol=rtol * size * fine, keep=keep, most=most, farthest=farthest,
-        linear_move=linear_move,
     )  # fmt: skip
     return Filtered(run, tuple(by), found)
 
@@ -523,18 +509,14 @@ class Likelihood:
     ) -> Filtered:
         """Return one run filtered under values by name, with derivatives by the names that it depends on."""
         gauges, problem, by = self.gauges(run), self.problem, self._dependences(run)
-
-        def filtered(**how: float) -> Filtered:
-            return filter_run(
+        for farthest in (np.inf, MAX_UPDATE):  # held back where it cannot be followed otherwise
+            found = filter_run(
                 problem.model, problem.experiment, run, problem.local(run, values), by=tuple(by.values()) if slopes else (),
-                gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most, **how,
+                gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
+                farthest=farthest,
             )  # fmt: skip
-
-        # a wide field holds the state to the readings, and then their tangents do
-        faint = values["field_amplitude"] < FAINT_FIELD * self._friction
-        found = filtered(linear_move=LINEAR_MOVE if faint else np.inf)
-        if not found.whole:  # held back where it cannot be followed otherwise
-            found = filtered(farthest=MAX_UPDATE, linear_move=np.inf)
+            if found.whole:
+                break
         return replace(found, names=tuple(by) if slopes else ())
 
     def _dependences(self, run: Run) -> dict[str, str]:
