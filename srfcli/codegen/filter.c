@@ -26,6 +26,9 @@ typedef double quad __attribute__((vector_size(32), may_alias)); /* wider vector
 #define SPRING -2
 #define NO_VARIANCE 1e150                   /* a variance that is none any more */
 #define MANY 1000                           /* steps between two readings, after which their pace is looked at */
+#define MAX_CORRECTION 4.0                  /* standard deviations of the states before a reading, by one of them */
+#define SCANNED_STARTS 8                    /* to either side, as far as that */
+#define UNLIKELY 9.0                        /* of a reading after them, three standard deviations: then others are tried */
 #define RELINEARISATIONS 8                  /* between two readings, at most */
 
 typedef struct {
@@ -582,7 +585,7 @@ static void expect(const Recording *run, int k, Place *at, const Course *course,
    is there (na) times `by`; the reading to which the tangent then leads, and the variance of that if the shifted state were known */
 typedef struct {
     dual shift[NX];
-    double by[NA], ahead, variance;
+    double by[NA], ahead, variance, cost, off;
 } Correction;
 
 /* the correction of the belief `from` by the tangent at `shift` (NX), from where the belief came */
@@ -648,61 +651,132 @@ static int bent(const Recording *run, int k, const Place *was, Place *at, Course
     course->mean_only = 0;
     resume(course, &then, at);
     memcpy(from->x, kept, sizeof kept);
-    return fabs(read - c.ahead) > limit;
+    return !(fabs(read - c.ahead) <= limit);
 }
 
-/* A belief at a reading, linearised about the state before as the reading corrects it: again until the next correction has what
-   the tangent says of it, by half a correction where a whole one leads to what is less likely (Gauss and Newton's method). Where the
-   corrected state cannot be followed, the belief stays as it was. Returns 0 where it stops early. */
-static int relinearise(const Recording *run, int k, const Place *was, Place *at, Course *course, const Belief *from, Belief *b, Expected *e) {
-    Correction best, c;
+/* Gauss and Newton's method for the most probable state at the reading before, from `shift` (NX) of its mean, to which `by` (na) leads:
+   until the next correction has what the tangent says of it, by a part of one where a whole one leads to what is less likely, or
+   cannot be followed. Leaves belief and expectation there, and returns 1; 0 where the start cannot be followed. */
+static int gauss_newton(const Recording *run, int k, const Place *was, Place *at, Course *course, const Belief *from, const dual *start, const double *led, Belief *b, Expected *e, Correction *best) {
+    const double close = run->linear[1];
+    Correction c;
     dual shift[NX];
-    double by[NA], lowest = INFINITY;
-    int found = 1, halved = 0;
-    memset(shift, 0, sizeof shift);
-    memset(by, 0, sizeof by);
-    memset(&best, 0, sizeof best);
-    for (int turn = 0; turn <= RELINEARISATIONS + 1; turn++) {
-        course->tangents = course->slopes;
+    double by[NA];
+    int partly = 0;
+    memcpy(shift, start, sizeof shift);
+    memcpy(by, led, course->na * sizeof *by);
+    for (int turn = 0;; turn++) {
+        const int last = turn > RELINEARISATIONS; /* at the likeliest, then */
+        double likelier = -INFINITY;
         copy_belief(course, from, b);
         begin_transition(course, b);
         resume(course, was, at);
         for (int i = 0; i < NX; i++) b->x[i] += shift[i].v, b->xd[i] += shift[i].d;
-        if (!(found = reach(run, k, at, course, b))) break;
-        expect(run, k, at, course, b, shift, e);
-        if (!(found = e->variance > 0.0 && e->variance < NO_VARIANCE)) break;
-        if (turn && !halved && fabs(e->there.v - c.ahead) <= run->linear[1] * sqrt(e->noise.v)) break;
-        correct(course, from, b, e, shift, &c);
-        double off = run->observed[k] - e->there.v, total = cost_of(course, from, by) + off * off / c.variance;
-        if (turn >= RELINEARISATIONS) { /* the likeliest, then */
-            if (total <= lowest || turn > RELINEARISATIONS) break;
-            memcpy(shift, best.shift, sizeof shift);
-            memcpy(by, best.by, sizeof by);
-            continue;
+        int found = reach(run, k, at, course, b);
+        if (found) {
+            expect(run, k, at, course, b, shift, e);
+            found = e->variance > 0.0 && e->variance < NO_VARIANCE;
         }
-        if (total > lowest) { /* towards the likeliest so far */
-            halved = 1;
-            for (int i = 0; i < NX; i++) shift[i] = srf_mul_c(srf_add(best.shift[i], shift[i]), 0.5);
-            for (int i = 0; i < course->na; i++) by[i] = 0.5 * (best.by[i] + by[i]);
-            continue;
+        if (!found && (!turn || last || *course->stop)) return 0;
+        if (found) {
+            int there = turn && !partly && fabs(e->there.v - c.ahead) <= close * sqrt(e->noise.v);
+            correct(course, from, b, e, shift, &c);
+            c.off = run->observed[k] - e->there.v;
+            c.cost = cost_of(course, from, by);
+            /* one variance for both: beside a fall that of the tangent grows without end */
+            double least = turn ? fmin(c.variance, best->variance) : c.variance;
+            likelier = turn ? best->cost - c.cost + (best->off * best->off - c.off * c.off) / least : 0.0;
+            if (there || last || (turn == RELINEARISATIONS && likelier >= 0.0)) {
+                best->cost = c.cost, best->off = c.off, best->variance = c.variance;
+                memcpy(best->shift, shift, sizeof shift);
+                memcpy(best->by, by, sizeof by);
+                return 1;
+            }
         }
-        halved = 0;
-        lowest = total;
-        memcpy(best.shift, shift, sizeof shift);
-        memcpy(best.by, by, sizeof by);
-        memcpy(shift, c.shift, sizeof shift);
-        memcpy(by, c.by, sizeof by);
+        if (turn == RELINEARISATIONS) {
+            memcpy(shift, best->shift, sizeof shift);
+            memcpy(by, best->by, sizeof by);
+        } else if (likelier < 0.0) {
+            partly = 1;
+            for (int i = 0; i < NX; i++) shift[i] = srf_mul_c(srf_add(best->shift[i], shift[i]), 0.5);
+            for (int i = 0; i < course->na; i++) by[i] = 0.5 * (best->by[i] + by[i]);
+        } else {
+            Correction next = c;
+            for (int i = 0; i < course->na; i++) next.by[i] -= by[i];
+            double far = sqrt(cost_of(course, from, next.by)), share = 1.0;
+            while (share * far > MAX_CORRECTION) share *= 0.5; /* constant, for derivatives */
+            partly = share < 1.0;
+            memcpy(c.shift, shift, sizeof shift);
+            memcpy(c.by, by, sizeof by);
+            *best = c;
+            for (int i = 0; i < NX; i++) shift[i] = srf_add(shift[i], srf_mul_c(srf_sub(next.shift[i], shift[i]), share));
+            for (int i = 0; i < course->na; i++) by[i] += share * next.by[i];
+        }
+    }
+}
+
+/* Where a shift of the states at the reading before leads that moves the least certain logarithm by so many standard deviations, and the others as
+   they go with it: the likeliest of a row of them, as `shift` (NX) and `by` (na). Returns 0 where none is likelier than `best`. */
+static int likelier_start(const Recording *run, int k, const Place *was, Place *at, Course *course, Belief *from, const Belief *b, const Expected *e, const Correction *best, dual *shift, double *by) {
+    double kept[NX], far = 0.0, lowest = best->cost + best->off * best->off / best->variance;
+    int along = 0, na = course->na;
+    dual y[NX], scale;
+    for (int i = 0; i < NX; i++)
+        if (run->logarithm[i] && from->P[i * na + i] > far) far = from->P[i * na + i], along = i;
+    if (!(far > 0.0)) return 0;
+    TAKE(scale, run->factor + k * wide);
+    for (int i = 0; i < NX; i++) y[i] = srf_plain(b->x[i]);
+    const double rest = e->there.v - scale.v * shown(run, k, at, y, NULL).v;
+    const Place then = place(course, *at);
+    memcpy(kept, from->x, sizeof kept);
+    memset(by, 0, NA * sizeof *by);
+    for (int side = -SCANNED_STARTS; side <= SCANNED_STARTS; side++) {
+        double size = side * MAX_CORRECTION / SCANNED_STARTS;
+        for (int i = 0; i < NX; i++) from->x[i] += size * from->P[i * na + along] / sqrt(far);
+        resume(course, was, at);
+        course->mean_only = 1;
+        if (side && travel(run, at, course, from, run->t[k])) {
+            for (int i = 0; i < NX; i++) y[i] = srf_plain(from->x[i]);
+            double off = run->observed[k] - rest - scale.v * shown(run, k, at, y, NULL).v, total = size * size + off * off / best->variance;
+            if (total < lowest) {
+                lowest = total;
+                by[along] = size / sqrt(far);
+            }
+        }
+        course->mean_only = 0;
+        memcpy(from->x, kept, sizeof kept);
+    }
+    resume(course, &then, at);
+    for (int i = 0; i < NX; i++) shift[i] = srf_plain(by[along] * from->P[i * na + along]);
+    return by[along] != 0.0;
+}
+
+/* A belief at a reading, linearised about the most probable state before. Where that cannot be followed, the belief stays as it
+   was. Returns 0 where it stops early. */
+static int relinearise(const Recording *run, int k, const Place *was, Place *at, Course *course, Belief *from, Belief *b, Expected *e) {
+    Correction best, other;
+    dual shift[NX];
+    double by[NA];
+    memset(shift, 0, sizeof shift);
+    memset(by, 0, sizeof by);
+    course->tangents = course->slopes;
+    int found = gauss_newton(run, k, was, at, course, from, shift, by, b, e, &best);
+    if (found && best.cost + best.off * best.off / best.variance > UNLIKELY && likelier_start(run, k, was, at, course, from, b, e, &best, shift, by)) {
+        found = gauss_newton(run, k, was, at, course, from, shift, by, b, e, &other);
+        double least = fmin(best.variance, other.variance);
+        if (!found || other.cost + other.off * other.off / least > best.cost + best.off * best.off / least)
+            found = gauss_newton(run, k, was, at, course, from, best.shift, best.by, b, e, &other);
     }
     course->tangents = 0;
-    if (!found) {
-        copy_belief(course, from, b);
-        begin_transition(course, b);
-        resume(course, was, at);
-        if (!reach(run, k, at, course, b)) return 0;
-        expect(run, k, at, course, b, NULL, e);
+    if (found) {
+        for (int i = 0; i < NX; i++) b->x[i] -= e->shifted[i].v, b->xd[i] -= e->shifted[i].d;
         return 1;
     }
-    for (int i = 0; i < NX; i++) b->x[i] -= e->shifted[i].v, b->xd[i] -= e->shifted[i].d;
+    copy_belief(course, from, b);
+    begin_transition(course, b);
+    resume(course, was, at);
+    if (!reach(run, k, at, course, b)) return 0;
+    expect(run, k, at, course, b, NULL, e);
     return 1;
 }
 
