@@ -38,7 +38,7 @@ from srfcli.data.values import Run
 from srfcli.inference.fit import Problem, fit_problem
 from srfcli.inference.prediction import predict
 from srfcli.laws.registry import load_registry
-from srfcli.motion.integrators import pieces
+from srfcli.motion.integrators import load_of_one_time, pieces
 
 Array = np.ndarray
 OURS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # a fit takes 1e-6
@@ -57,7 +57,7 @@ def solved(run: Run, slider: Slider, functions: tuple[Callable[..., Any], Callab
     state = steady(replace(slider, V=run.drive.piece(first)[0], W0=run.load.rest(first)))
     u = np.full(run.t.size, state[0])
     for a, b in pieces(run.t, run.drive, run.load):
-        W_at, (V, acceleration, since) = run.load.piece(0.5 * (a + b)), run.drive.piece(0.5 * (a + b))
+        W_at, (V, acceleration, since) = load_of_one_time(run.load, a, b), run.drive.piece(0.5 * (a + b))
         wanted = np.nonzero((run.t > a) & (run.t <= b))[0]
         times = np.unique([a, *run.t[wanted], b])
         found = solve_ivp(

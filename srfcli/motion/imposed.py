@@ -13,7 +13,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, TypeVar
 
@@ -30,7 +30,6 @@ Number = TypeVar("Number", float, Array)
 
 # The imposed normal load: constant, modulated, or any other; um, s, N.
 
-LoadPiece = Callable[[float], tuple[float, float]]
 RISE = 5.0  # periods over which a modulation rises where nothing else is said, as the format has it
 PIECES_PER_PERIOD = 16  # polynomials per period of a modulation: degree 7 then errs by 4e-13 of its amplitude
 DEGREE = 7
@@ -45,13 +44,9 @@ class Load(abc.ABC):
         """Return the longest step (s) that jumps over nothing between two breaks."""
         return math.inf
 
-    @abc.abstractmethod
-    def piece(self, t: float) -> LoadPiece:
-        """Return W and dW/dt as a function of one time, valid on the smooth piece that holds at `t`."""
-
     def rest(self, t: float) -> float:
         """Return the load under which sliding at time `t` is steady when nothing is modulated: W itself where nothing is."""
-        return self.piece(t)(t)[0]
+        return float(self(np.array([t]))[0][0])
 
     def check(self, start: float, end: float) -> None:  # noqa: B027
         """Raise SrfError where the load is not known on all of [start, end]."""
@@ -63,17 +58,9 @@ class Load(abc.ABC):
         On [knots[i], knots[i + 1]] W is the sum of coefficients[i, j] (t - knots[i])^j; every break inside is a knot.
         """
 
+    @abc.abstractmethod
     def __call__(self, t: Array) -> tuple[Array, Array]:
         """Return W and dW/dt at the times `t`, as arrays."""
-        bounds = np.array(self.breaks, dtype=float)
-        t = np.asarray(t, dtype=float)
-        piece = np.searchsorted(bounds, t, side="right")
-        out = np.empty((2, t.size))
-        for k in np.unique(piece):
-            members = np.nonzero(piece == k)[0]
-            function = self.piece(float(t[members[0]]))
-            out[:, members] = np.array([function(s) for s in t[members].tolist()]).T
-        return out[0], out[1]
 
 
 @dataclass(frozen=True)
@@ -84,10 +71,6 @@ class ConstantLoad(Load):
 
     def __post_init__(self) -> None:
         _check_positive("W0", self.W0)
-
-    def piece(self, t: float) -> LoadPiece:
-        W0 = self.W0
-        return lambda s: (W0, 0.0)
 
     def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
         _check_interval(start, end)
@@ -139,54 +122,29 @@ class Modulation(Load):
     def longest_step(self, start: float, end: float) -> float:
         return 0.25 / self.f if self.eps else math.inf  # a longer one could jump over whole periods of a quiet start
 
-    def piece(self, t: float) -> LoadPiece:
-        W0, omega, phase, cos, sin = self.W0, 2 * math.pi * self.f, self.phase, math.cos, math.sin
-        amplitude, onset = self.eps * self.W0, self.onset
-        if t < onset or not self.eps:
-            return lambda s: (W0, 0.0)
-
-        def whole(s: float) -> tuple[float, float]:
-            angle = omega * s + phase
-            return W0 + amplitude * cos(angle), -amplitude * omega * sin(angle)
-
-        if t >= self.full:
-            return whole
-        length = self.full - onset
-
-        def rising(s: float) -> tuple[float, float]:
-            r = (s - onset) / length
-            share, rate = r * r * r * (10 - 15 * r + 6 * r * r), 30 * r * r * (1 - r) * (1 - r) / length
-            W, W_dot = whole(s)
-            return W0 + share * (W - W0), share * W_dot + rate * (W - W0)
-
-        return rising
-
     def rest(self, t: float) -> float:
         return self.W0
 
-    def _on_piece(self, t: Array, at: float) -> Array:
-        """Return W at many times by the formula that holds at `at`: a record has tens of thousands of knots."""
-        if at < self.onset or not self.eps:
-            return np.full(t.shape, self.W0)
-        wave = self.eps * self.W0 * np.cos(2 * math.pi * self.f * t + self.phase)
-        if at < self.full:
-            r = (t - self.onset) / (self.full - self.onset)
-            wave *= r * r * r * (10 - 15 * r + 6 * r * r)
-        return self.W0 + wave
+    def __call__(self, t: Array) -> tuple[Array, Array]:
+        t = np.asarray(t, dtype=float)
+        share, rate = np.ones(t.shape), np.zeros(t.shape)
+        if self.breaks:
+            length = self.full - self.onset
+            r = np.clip((t - self.onset) / length, 0.0, 1.0)
+            share, rate = r * r * r * (10 - 15 * r + 6 * r * r), 30 * r * r * (1 - r) * (1 - r) / length
+        amplitude, omega = self.eps * self.W0, 2 * math.pi * self.f
+        wave, slope = amplitude * np.cos(omega * t + self.phase), -amplitude * omega * np.sin(omega * t + self.phase)
+        return self.W0 + share * wave, share * slope + rate * wave
 
     def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
         _check_interval(start, end)
-        inside = [b for b in self.breaks if start < b < end]
-        knots, rows = [np.array([start])], []
-        for a, b in pairwise([start, *inside, end]):
-            edges = np.array([a, b])
-            middle = 0.5 * (a + b)
-            if self.eps and middle >= self.onset:
-                length = 1 / self.f if middle >= self.full else min(1 / self.f, self.full - self.onset)
-                edges = np.linspace(a, b, math.ceil((b - a) * PIECES_PER_PERIOD / length) + 1)
-            rows.append(fit_polynomials(partial(self._on_piece, at=middle), edges))
-            knots.append(edges[1:])
-        return np.concatenate(knots), np.concatenate(rows)
+        knots = [np.array([start])]
+        for a, b in pairwise([start, *(t for t in self.breaks if start < t < end), end]):
+            length = 1 / self.f if a >= self.full else min(1 / self.f, self.full - self.onset)
+            count = math.ceil((b - a) * PIECES_PER_PERIOD / length) if self.eps and b > self.onset else 1
+            knots.append(np.linspace(a, b, count + 1)[1:])
+        edges = np.concatenate(knots)
+        return edges, fit_polynomials(lambda t: self(t)[0], edges)
 
 
 def fit_polynomials(function: Callable[[Array], Array], edges: Array) -> Array:
@@ -209,15 +167,8 @@ def fit_polynomials(function: Callable[[Array], Array], edges: Array) -> Array:
 def _interpolation() -> tuple[Array, Array]:
     """Return the points in [0, 1], rising, and the matrix that turns values there into coefficients of powers."""
     shares = 0.5 - 0.5 * np.cos(np.pi * np.arange(DEGREE + 1) / DEGREE)
-    series = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * shares - 1, DEGREE))
-    to_powers = np.array([_shifted_chebyshev(j) for j in range(DEGREE + 1)])  # row j: T_j(2 r - 1) in powers of r
-    return shares, (series.T @ to_powers)
-
-
-def _shifted_chebyshev(degree: int) -> Array:
-    basis = np.polynomial.chebyshev.Chebyshev.basis(degree, domain=[0.0, 1.0])
-    powers = basis.convert(kind=np.polynomial.Polynomial, domain=[-1.0, 1.0], window=[-1.0, 1.0]).coef
-    return np.pad(np.round(powers), (0, DEGREE + 1 - powers.size))  # whole numbers
+    others = [np.delete(shares, j) for j in range(DEGREE + 1)]
+    return shares, np.array([np.poly(x)[::-1] / np.prod(at - x) for at, x in zip(shares, others, strict=True)])
 
 
 def _check_interval(start: float, end: float) -> None:
@@ -243,11 +194,34 @@ SPACINGS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # samples between t
 SMOOTHING_BLOCK = 32  # samples over which the smoothness may vary
 
 
-class SampledLoad(Load):
-    """The measured load `W` (N) at `times` (s, rising, four or more); `noise` (N) is its measurement error, 0 to interpolate.
+class PolynomialLoad(Load):
+    """A load that consists of `coefficients` (k, degree + 1), lowest power first in the time since the knot, at `knots` (k + 1,).
 
-    `knots` (k + 1,) and `coefficients` (k, 8), lowest power first in the time since the knot, are what it consists of.
+    The first polynomial and the last hold beyond the knots.
     """
+
+    knots: Array
+    coefficients: Array
+
+    def __call__(self, t: Array) -> tuple[Array, Array]:
+        t = np.asarray(t, dtype=float)
+        i = np.clip(np.searchsorted(self.knots, t, side="right") - 1, 0, len(self.coefficients) - 1)
+        return horner([c[i] for c in self.coefficients.T], t - self.knots[i])
+
+    def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
+        _check_interval(start, end)
+        self.check(start, end)
+        count = len(self.coefficients)
+        first = int(np.clip(np.searchsorted(self.knots, start, side="right") - 1, 0, count - 1))
+        last = int(np.clip(np.searchsorted(self.knots, end, side="left"), first + 1, count))
+        knots, rows = self.knots[first : last + 1].copy(), self.coefficients[first:last].copy()
+        rows[0] = _shifted(rows[0], start - knots[0])
+        knots[0], knots[-1] = start, end
+        return knots, rows
+
+
+class SampledLoad(PolynomialLoad):
+    """The measured load `W` (N) at `times` (s, rising, four or more); `noise` (N) is its measurement error, 0 to interpolate."""
 
     def __init__(self, times: Array, W: Array, *, noise: float = 0.0) -> None:
         t, values = np.asarray(times, dtype=float), np.asarray(W, dtype=float)
@@ -260,7 +234,6 @@ class SampledLoad(Load):
         self.times, self.W, self.noise = t, values, float(noise)
         self.knots, self.coefficients, self.breaks = _build(t, values, self.noise)
         self._check_contact()
-        self._knots, self._rows = self.knots.tolist(), self.coefficients.tolist()
         self._longest: dict[tuple[float, float], float] = {}
 
     def _check_contact(self) -> None:
@@ -273,41 +246,17 @@ class SampledLoad(Load):
 
     def longest_step(self, start: float, end: float) -> float:
         if (start, end) not in self._longest:  # asked for at each evaluation of a likelihood
-            inside = self.knots[bisect_right(self._knots, start) - 1 : int(np.searchsorted(self.knots, end, side="left")) + 1]
+            first, last = np.searchsorted(self.knots, start, side="right") - 1, np.searchsorted(self.knots, end, side="left")
+            inside = self.knots[first : last + 1]
             self._longest[start, end] = float(4 * np.median(np.diff(inside))) if inside.size > 1 else math.inf
         return self._longest[start, end]
 
     def check(self, start: float, end: float) -> None:
-        if start < self._knots[0] or end > self._knots[-1]:
+        if start < self.knots[0] or end > self.knots[-1]:
             raise SrfError(
-                f"the load is known from {self._knots[0]:g} to {self._knots[-1]:g} s, not over all of {start:g} to {end:g} s",
+                f"the load is known from {self.knots[0]:g} to {self.knots[-1]:g} s, not over all of {start:g} to {end:g} s",
                 "simulate within the times of the load's samples",
             )
-
-    def piece(self, t: float) -> LoadPiece:
-        knots, rows, last = self._knots, self._rows, len(self._knots) - 2
-
-        def spline(s: float) -> tuple[float, float]:
-            i = min(max(bisect_right(knots, s) - 1, 0), last)
-            return _horner(rows[i], s - knots[i])
-
-        return spline
-
-    def __call__(self, t: Array) -> tuple[Array, Array]:
-        t = np.asarray(t, dtype=float)
-        i = np.clip(np.searchsorted(self.knots, t, side="right") - 1, 0, len(self._rows) - 1)
-        return _horner([c[i] for c in self.coefficients.T], t - self.knots[i])
-
-    def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
-        self.check(start, end)
-        if not start < end:
-            raise SrfError(f"a load is asked for from {start:g} to {end:g} s", "give two times that rise")
-        first = min(max(bisect_right(self._knots, start) - 1, 0), len(self._rows) - 1)
-        last = int(np.searchsorted(self.knots, end, side="left"))
-        knots, rows = self.knots[first : last + 1].copy(), self.coefficients[first:last].copy()
-        rows[0] = _shifted(rows[0], start - knots[0])
-        knots[0], knots[-1] = start, end
-        return knots, rows
 
 
 def _build(t: Array, W: Array, noise: float) -> tuple[Array, Array, tuple[float, ...]]:
@@ -368,10 +317,8 @@ def interpolation_error(t: Array, x: Array, reach: int) -> tuple[Array, Array]:
 
 def _rough(t: Array, W: Array, total: float, noise: float) -> NDArray[np.bool_]:
     """Return which samples of a stretch the polynomial through their eight neighbours does not predict."""
-    from numpy.lib.stride_tricks import sliding_window_view
-
     error, unit = interpolation_error(t, W, INTERPOLATION_SAMPLES)
-    ranges = np.ptp(sliding_window_view(W, 2 * INTERPOLATION_SAMPLES + 1), axis=1)
+    ranges = np.ptp(np.lib.stride_tricks.sliding_window_view(W, 2 * INTERPOLATION_SAMPLES + 1), axis=1)
     rough = np.zeros(W.size, bool)
     rough[INTERPOLATION_SAMPLES:-INTERPOLATION_SAMPLES] = error > np.maximum(
         ROUGH * ranges, np.maximum(LEAST_CORNER * total, 5 * noise * unit)
@@ -459,7 +406,7 @@ def _bridge(
     t: Array, W: Array, first: int, last: int, before: tuple[Array, Array] | None, after: tuple[Array, Array] | None
 ) -> tuple[Array, Array]:
     """Return monotone cubics through samples `first` to `last` that continue the splines before and after."""
-    from scipy.interpolate import PchipInterpolator
+    from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
     low, high = max(first - 1, 0), min(last + 2, t.size)  # a sample more on each side tells the slope at the ends
     x, y = t[first : last + 1], W[first : last + 1].copy()
@@ -475,21 +422,18 @@ def _bridge(
             slope = _end(fit)[1] if place == 0 else fit[1][0, 1]
             if slope * secants[place] >= 0 and abs(slope) <= 3 * abs(secants[place]):  # stays monotone
                 slopes[place] = slope
-    h = np.diff(x)
-    rows = np.zeros((h.size, DEGREE + 1))
-    rows[:, 0], rows[:, 1] = y[:-1], slopes[:-1]
-    rows[:, 2] = (3 * secants - 2 * slopes[:-1] - slopes[1:]) / h
-    rows[:, 3] = (slopes[:-1] + slopes[1:] - 2 * secants) / h**2
+    rows = np.zeros((x.size - 1, DEGREE + 1))
+    rows[:, :4] = CubicHermiteSpline(x, y, slopes).c[::-1].T
     return x, rows
 
 
 def _end(fit: tuple[Array, Array]) -> tuple[float, float]:
     """Return value and slope at the last knot."""
     knots, rows = fit
-    return _horner(rows[-1].tolist(), float(knots[-1] - knots[-2]))
+    return horner(rows[-1].tolist(), float(knots[-1] - knots[-2]))
 
 
-def _horner(coefficients: Sequence[Number], h: Number) -> tuple[Number, Number]:
+def horner(coefficients: Sequence[Number], h: Number) -> tuple[Number, Number]:
     """Return value and slope at `h` of a polynomial, its lowest power first."""
     value, slope = 0.0 * h, 0.0 * h
     for c in reversed(coefficients):
@@ -505,7 +449,7 @@ ONE_CORNER = 1e-4  # corners closer than this share of the rise are one: W is th
 
 
 @dataclass(frozen=True)
-class LoadSteps(Load):
+class LoadSteps(PolynomialLoad):
     """Straight pieces of load, joined smoothly: piece i runs from `first[i]` to `last[i]` (N) over edges[i] to edges[i + 1] (s).
 
     Jumps and corners are rounded over the `rise` seconds after each edge by the same quintic step, so that W has two
@@ -554,27 +498,14 @@ class LoadSteps(Load):
                 kept.append(t)
         return tuple(kept)
 
-    def piece(self, t: float) -> LoadPiece:
-        i = bisect_right(self.breaks, t)
-        knot = self.breaks[i - 1] if i else t
-        coefficients = self._expanded(knot, self._inside(i)).tolist()
-        return lambda s: _horner(coefficients, s - knot)
+    @cached_property
+    def knots(self) -> Array:  # type: ignore[override]
+        ends = (self.breaks[0] - 1.0, self.breaks[-1] + 1.0) if self.breaks else (0.0, 1.0)
+        return np.array([ends[0], *self.breaks, ends[1]])
 
-    def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
-        """Return knots (k + 1,) and coefficients (k, 7), lowest power first in t - knots[i]: W on [start, end], exactly."""
-        inner = [b for b in self.breaks if start < b < end]
-        knots = np.array([start, *inner, end])
-        rows = [self._expanded(a, 0.5 * (a + b)) for a, b in pairwise(knots.tolist())]
-        return knots, np.array(rows)
-
-    def _inside(self, i: int) -> float:
-        """Return a time inside the smooth piece number `i`, which ends at breaks[i]."""
-        breaks = self.breaks
-        if not breaks:
-            return 0.0
-        if i == 0:
-            return breaks[0] - 1.0
-        return breaks[-1] + 1.0 if i == len(breaks) else 0.5 * (breaks[i - 1] + breaks[i])
+    @cached_property
+    def coefficients(self) -> Array:  # type: ignore[override]
+        return np.array([self._expanded(a, 0.5 * (a + b)) for a, b in pairwise(self.knots.tolist())])
 
     def _expanded(self, knot: float, inside: float) -> Array:
         """Return the coefficients about `knot` of the polynomial that holds at `inside`, (7,)."""
@@ -618,14 +549,9 @@ class ModulatedLoad(Load):
     def check(self, start: float, end: float) -> None:
         self.base.check(start, end)
 
-    def piece(self, t: float) -> LoadPiece:
-        base, shape = self.base.piece(t), self.shape.piece(t)
-
-        def product(s: float) -> tuple[float, float]:
-            (W, W_dot), (m, m_dot) = base(s), shape(s)
-            return W * m, W_dot * m + W * m_dot
-
-        return product
+    def __call__(self, t: Array) -> tuple[Array, Array]:
+        (W, W_dot), (m, m_dot) = self.base(t), self.shape(t)
+        return W * m, W_dot * m + W * m_dot
 
     def rest(self, t: float) -> float:
         return self.base.rest(t)

@@ -14,6 +14,7 @@ import ctypes
 import math
 import threading
 import warnings
+from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,7 +28,7 @@ from srfcli.codegen.c_source import compiled, formulas_of
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.codegen.splines import Spline, appended, tables_after
 from srfcli.core.errors import SrfError, Status
-from srfcli.motion.imposed import Drive, Load
+from srfcli.motion.imposed import Drive, Load, horner
 
 SIGNAL_INTERVAL = 0.1  # s between looks for a signal where waiting for a thread cannot be interrupted (Windows)
 MAX_STEPS = 20_000_000  # of the compiled integrator, in all; a hundred times an hour of modulation
@@ -196,7 +197,7 @@ def integrate_lsoda(
     functions = [scalar_function(model, name, p) for name in names]
     status, reached, steps = Status.OK, float(t[0]), 0
     for a, b in pieces(t, drive, load):
-        f, df = _on_piece(functions, np.array(by, dtype=int), drive, load, 0.5 * (a + b))
+        f, df = _on_piece(functions, np.array(by, dtype=int), drive, load, a, b)
         wanted = np.nonzero((t > a) & (t <= b))[0]
         times = np.unique([a, *t[wanted], b])
         found, good, count = _march(f, df if not k else None, state, times, relative, tolerance, load.longest_step(a, b))
@@ -210,14 +211,16 @@ def integrate_lsoda(
     return Motion(y[:, :n], y[:, n:].reshape(t.size, n, k), status, reached, steps)
 
 
-def _on_piece(functions: Sequence[ScalarFunction], by: Array, drive: Drive, load: Load, within: float) -> tuple[Rates, Rates]:
-    """Return the rates of state and sensitivities, and the Jacobian, as functions of (t, y) where the piece at `within` holds.
+def _on_piece(
+    functions: Sequence[ScalarFunction], by: Array, drive: Drive, load: Load, begin: float, end: float
+) -> tuple[Rates, Rates]:
+    """Return the rates of state and sensitivities, and the Jacobian, as functions of (t, y) between two breaks of drive and load.
 
     `functions` of one state are the rates, their Jacobian and, where there are derivatives `by` parameters, these.
     """
     rates_of, jacobian_of, *by_parameters = functions
-    W_at = load.piece(within)
-    V0, acceleration, since = drive.piece(within)
+    W_at = load_of_one_time(load, begin, end)
+    V0, acceleration, since = drive.piece(0.5 * (begin + end))
 
     def inputs(t: float) -> tuple[float, float, float]:
         return (V0 + acceleration * (t - since) if acceleration else V0, *W_at(t))
@@ -245,6 +248,17 @@ def _on_piece(functions: Sequence[ScalarFunction], by: Array, drive: Drive, load
             return np.full(y.size, OVERFLOWN_RATE)
 
     return (augmented if by.size else rates), jacobian
+
+
+def load_of_one_time(load: Load, begin: float, end: float) -> Callable[[float], tuple[float, float]]:
+    """Return W and dW/dt on [begin, end] as a function of one time, in Python floats."""
+    knots, coefficients = (array.tolist() for array in load.polynomials(begin, end))
+
+    def found(t: float) -> tuple[float, float]:
+        i = min(max(bisect_right(knots, t) - 1, 0), len(coefficients) - 1)
+        return horner(coefficients[i], t - knots[i])
+
+    return found
 
 
 def _march(
