@@ -14,7 +14,7 @@ from srfcli.codegen.model import Array
 from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError
 from srfcli.data.clock import Mask
-from srfcli.motion.imposed import interpolation_error, runs_of
+from srfcli.motion.imposed import interpolation_error, lagrange, runs_of
 
 SEGMENT = 256  # samples of a periodogram
 INTERPOLATED_FROM = 16  # from which a sample is interpolated: to 1e-4 for sines of five samples a period or more
@@ -180,11 +180,8 @@ def _off_neighbours(x: Array, first: NDArray[np.intp], width: int) -> Array:
     """
     at = np.array([-2.0, -1.0, width, width + 1.0])
     sides = np.stack([x[first - 2], x[first - 1], x[first + width], x[first + width + 1]])
-    off = []
-    for k in range(width):
-        weights = [np.prod((k - np.delete(at, j)) / (at[j] - np.delete(at, j))) for j in range(4)]
-        off.append(np.abs(x[first + k] - np.array(weights) @ sides))
-    return np.asarray(np.min(off, axis=0))
+    group = np.stack([x[first + k] for k in range(width)])
+    return np.asarray(np.abs(group - lagrange(at, np.arange(width)) @ sides).min(axis=0))
 
 
 def saturation(x: Array, *, fewest: int = 1) -> Mask:

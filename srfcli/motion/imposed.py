@@ -308,11 +308,17 @@ def interpolation_error(t: Array, x: Array, reach: int) -> tuple[Array, Array]:
     """
     times, values = (np.lib.stride_tricks.sliding_window_view(a, 2 * reach + 1) for a in (t, x))
     near, beside = (np.delete(a, reach, axis=1) for a in (times, values))
-    weights = np.ones(near.shape)  # Lagrange's
-    for j in range(2 * reach):
-        others = np.delete(near, j, axis=1)
-        weights[:, j] = np.prod((times[:, reach, None] - others) / (near[:, j, None] - others), axis=1)
+    weights = lagrange(near, times[:, reach])
     return np.abs(values[:, reach] - np.sum(beside * weights, axis=1)), np.sqrt(1 + np.sum(weights**2, axis=1))
+
+
+def lagrange(nodes: Array, at: Array) -> Array:
+    """Return the Lagrange polynomials on `nodes` (..., k) at the places `at` (...), (..., k)."""
+    weights = np.empty((*at.shape, nodes.shape[-1]))
+    for j in range(nodes.shape[-1]):
+        others = np.delete(nodes, j, axis=-1)
+        weights[..., j] = np.prod((at[..., None] - others) / (nodes[..., j, None] - others), axis=-1)
+    return weights
 
 
 def _rough(t: Array, W: Array, total: float, noise: float) -> NDArray[np.bool_]:

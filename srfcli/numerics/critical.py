@@ -21,6 +21,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
+from srfcli.motion.imposed import interpolation_error
 from srfcli.numerics.boundary import BoundaryPoint, along, pick_multiplier, polish, upper_half
 from srfcli.numerics.collocation import Discretisation, join, mesh_error, wanted_mesh
 from srfcli.numerics.hopf import critical_point
@@ -30,7 +31,6 @@ from srfcli.numerics.orbit import (
     between,
     growth,
     interpolate,
-    lagrange,
     line_orbits,
     neighbours,
     robust_orbits,
@@ -429,7 +429,7 @@ def _suspects(position: Array, g: Array, resolution: float) -> Array:
     It could where the cubic through the interval's ends and their neighbours comes within its error of zero.
     """
     usable = np.isfinite(g)
-    error = interpolation_error(position, g)
+    error = _cubic_errors(position, g)
     worst = np.maximum(error[:-1], error[1:])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         nearest = np.minimum(np.minimum(np.abs(g[:-1]), np.abs(g[1:])), _closest_inside(position, g))
@@ -448,16 +448,11 @@ def _closest_inside(position: Array, g: Array) -> Array:
     return (value * np.sign(g[:-1])[:, None]).min(axis=1)
 
 
-def interpolation_error(position: Array, g: Array) -> Array:
+def _cubic_errors(position: Array, g: Array) -> Array:
     """Return for each sample how far it lies from the cubic through its two neighbours on either side, 0 where those lack."""
-    error = np.zeros_like(g)
     if len(g) < 5:
-        return error
-    around = np.arange(len(g) - 4)[:, None] + [0, 1, 3, 4]
-    estimate = (lagrange(position[around], position[2:-2]) * g[around]).sum(axis=-1)
-    error[2:-2] = np.nan_to_num(np.abs(g[2:-2] - estimate))
-    error[:2], error[-2:] = error[2], error[-3]
-    return error
+        return np.zeros_like(g)
+    return np.pad(np.nan_to_num(interpolation_error(position, g, 2)[0]), 2, mode="edge")
 
 
 def _with_samples(model: GeneratedModel, base: Array, scan: LineScan, left: Array, share: Array, *, log: bool) -> LineScan:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
+from srfcli.motion.imposed import lagrange
 from srfcli.numerics.collocation import (
     LOG_STEP,
     STAGES,
@@ -118,16 +119,6 @@ def interpolate(orbit: Discretisation, edges: Array) -> Discretisation:
         return np.einsum("...k,...kn->...n", lagrange(nodes, s), values)
 
     return Discretisation(at(edges[:-1]), at(phases), edges)
-
-
-def lagrange(nodes: Array, at: Array) -> Array:
-    """Return the Lagrange polynomials on `nodes` (..., k) at the places `at` (...), (..., k)."""
-    weights = np.ones((*at.shape, nodes.shape[-1]))
-    for i in range(nodes.shape[-1]):
-        for j in range(nodes.shape[-1]):
-            if j != i:
-                weights[..., i] *= (at - nodes[..., j]) / (nodes[..., i] - nodes[..., j])
-    return weights
 
 
 def levels(count: int, stride: int = STRIDE) -> list[Array]:
