@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel
+from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.thresholds import Thresholds
 from srfcli.inference.free_parameters import RHO, Scale
@@ -23,7 +23,7 @@ from srfcli.inference.profile import CHI2_95, Interval, Refits, interval_end, qu
 from srfcli.numerics.boundary import CHUNK, BoundaryPoint, along, linearise_boundary, polish
 from srfcli.numerics.collocation import by_mesh, join
 from srfcli.numerics.critical import critical_line
-from srfcli.numerics.hopf import HopfPoint, hopf_points, steady_is_stable
+from srfcli.numerics.hopf import HopfPoint, by_frequency_and_load, characteristic_slopes, hopf_points, steady_is_stable
 
 # Measured critical loads against computed ones: each is compared with the nearest odd crossing of its own line.
 #
@@ -287,27 +287,9 @@ def forced_slopes(model: GeneratedModel, points: Sequence[BoundaryPoint], names:
 
 def hopf_slopes(model: GeneratedModel, p: Array, point: HopfPoint, names: tuple[str, ...]) -> Array:
     """Return dW0c/d(name) (k,) of a Hopf point of steady sliding at `p` (n_parameters,), all else fixed; base units."""
-    q = p.copy()
-    q[model.index("W0")] = point.W0
-    s = 1j * point.Omega
-    a = _coefficients(model, q, None)[0]
-    by_s = (np.arange(1, len(a)) * a[1:]) @ s ** np.arange(len(a) - 1)
-    by_load = _coefficients(model, q, "W0")[1] @ s ** np.arange(len(a))
-    matrix = np.array([[(1j * by_s).real, by_load.real], [(1j * by_s).imag, by_load.imag]])
-    columns = [_coefficients(model, q, name)[1] @ s ** np.arange(len(a)) for name in names]
-    right = -np.array([[c.real for c in columns], [c.imag for c in columns]])
-    return np.linalg.solve(matrix, right)[1]
-
-
-def _coefficients(model: GeneratedModel, p: Array, name: str | None) -> tuple[Array, Array]:
-    """Return the characteristic polynomial's coefficients (n+1,) and their derivatives by parameter `name`."""
-    shifted: list[complex] = [complex(v) for v in p]
-    h = 0.0
-    if name is not None:
-        h = COMPLEX_STEP * (abs(p[model.index(name)]) or 1.0)
-        shifted[model.index(name)] += 1j * h
-    a = np.asarray(model.characteristic(shifted))
-    return a.real, a.imag / h if h else np.zeros(a.shape)
+    _, by_s, by_load = characteristic_slopes(model, p, point.W0, 1j * point.Omega)
+    columns = np.array([characteristic_slopes(model, p, point.W0, 1j * point.Omega, name)[2] for name in names])
+    return np.linalg.solve(by_frequency_and_load(by_s, by_load), -np.array([columns.real, columns.imag]))[1]
 
 
 # Parameters from measured critical loads: the paper's procedure with Powell's method, and a least squares beside it.

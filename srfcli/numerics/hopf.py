@@ -155,8 +155,8 @@ def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
     if abs(nearest.real) > 1e-2 * Omega:
         return None
     for _ in range(30):
-        value, by_s, by_load = _polynomial(model, p, W0, 1j * Omega)
-        matrix = _by_frequency_and_load(by_s, by_load)
+        value, by_s, by_load = characteristic_slopes(model, p, W0, 1j * Omega)
+        matrix = by_frequency_and_load(by_s, by_load)
         if abs(np.linalg.det(matrix)) == 0:
             return None
         step = np.linalg.solve(matrix, [-value.real, -value.imag])
@@ -170,8 +170,8 @@ def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
             break
     if residual > WORST_RESIDUAL:
         return None  # not a root: rounding in the determinant
-    _, by_s, by_load = _polynomial(model, p, W0, 1j * Omega)
-    if not _rounding(model, p, W0, Omega, _by_frequency_and_load(by_s, by_load)) < WORST_ROUNDING:
+    _, by_s, by_load = characteristic_slopes(model, p, W0, 1j * Omega)
+    if not _rounding(model, p, W0, Omega, by_frequency_and_load(by_s, by_load)) < WORST_ROUNDING:
         return None  # rounding in the polynomial itself
     roots = np.roots(np.asarray(model.characteristic(_with_load(model, p, W0)))[::-1])
     others = roots[np.abs(np.abs(roots.imag) - Omega) + np.abs(roots.real) > 1e-5 * Omega]
@@ -185,16 +185,20 @@ def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
     )
 
 
-def _polynomial(model: GeneratedModel, p: Array, W0: float, s: complex) -> tuple[complex, complex, complex]:
-    """Return the characteristic polynomial at s and its derivatives by s and by W0 (complex step)."""
-    h = 1e-30 * W0
-    a = np.asarray(model.characteristic(_with_load(model, p, complex(W0, h))))
+def characteristic_slopes(
+    model: GeneratedModel, p: Array, W0: float, s: complex, name: str = "W0"
+) -> tuple[complex, complex, complex]:
+    """Return the characteristic polynomial at load `W0` and s, and its derivatives by s and by parameter `name`."""
+    q = np.array(_with_load(model, p, W0), dtype=complex)
+    h = COMPLEX_STEP * (abs(q[model.index(name)]) or 1.0)
+    q[model.index(name)] += 1j * h
+    a = np.asarray(model.characteristic(q))
     powers = s ** np.arange(a.shape[-1])
     k = np.arange(1, a.shape[-1])
     return complex(a.real @ powers), complex((k * a.real[1:]) @ powers[:-1]), complex((a.imag / h) @ powers)
 
 
-def _by_frequency_and_load(by_s: complex, by_load: complex) -> Array:
+def by_frequency_and_load(by_s: complex, by_load: complex) -> Array:
     """Return the derivatives (2, 2) of the real and the imaginary part of P(i Omega; W0) by Omega and W0."""
     return np.array([[(1j * by_s).real, by_load.real], [(1j * by_s).imag, by_load.imag]])
 
