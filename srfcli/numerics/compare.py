@@ -22,7 +22,8 @@ from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane, po
 
 ADJUSTED = ("A", "B", "D0")  # what is adjusted to slope, critical load and critical period
 FRICTION_LEVEL = "mu0"  # adjusted to the level of friction, which is what a modulated load works on
-STEP, LARGEST, SMALLEST, TOLERANCE = 1e-6, 0.7, 1e-4, 1e-9
+TOLERANCE = 1e-10  # of the search for the adjusted parameters
+OUTSIDE = 1e3  # the miss where there is no critical load
 
 
 @dataclass(frozen=True)
@@ -76,76 +77,48 @@ def check_adjusted(model: GeneratedModel, names: Sequence[str]) -> None:
 def match(model: GeneratedModel, p: Array, goal: Observables, names: Sequence[str] = ADJUSTED) -> Match:
     """Return `p` with three parameters, and mu0 where there is one, adjusted until the observables are those of `goal`.
 
-    Newton's method in the parameters' logarithms, from their values in `p`.
+    The search is in the parameters' logarithms, from their values in `p`.
     """
+    from scipy.optimize import root
+
     check_adjusted(model, names)
-    adjusted = tuple(names)
-    level = FRICTION_LEVEL in model.names
-    rows = [model.index(n) for n in adjusted]
-    q = _levelled(model, p, goal)
-    miss = _miss(model, q, goal)
-    for _ in range(60):
-        if miss is None or np.abs(miss).max() < TOLERANCE:
-            break
-        jacobian = np.empty((3, 3))
-        for k, row in enumerate(rows):
-            moved = q.copy()
-            moved[row] *= 1 + STEP
-            there = _miss(model, moved, goal)
-            if there is None:
-                return Match(q, adjusted, float(np.abs(miss).max()), Status.NO_CONVERGENCE)
-            jacobian[:, k] = (there - miss) / STEP
-        step = np.linalg.lstsq(jacobian, -miss, rcond=None)[0]
-        step *= min(1.0, LARGEST / max(float(np.abs(step).max()), 1e-300))
-        shorter, here = 1.0, None
-        while shorter > SMALLEST:  # a full step may leave the velocity-weakening regime
-            trial = q.copy()
-            trial[rows] *= np.exp(shorter * step)
-            trial = _levelled(model, trial, goal)
-            here = _miss(model, trial, goal)
-            if here is not None and np.linalg.norm(here) < (1 - 0.1 * shorter) * np.linalg.norm(miss):
-                break
-            shorter /= 2
-        if here is None or shorter <= SMALLEST:
-            break
-        q, miss = trial, here
-    left = np.inf if miss is None else float(np.abs(miss).max())
-    if level and miss is not None:
-        reached = observe(model, q, goal.V)
-        left = max(left, abs(reached.friction / goal.friction - 1)) if reached else np.inf
-    names_of_all = (*adjusted, FRICTION_LEVEL) if level else adjusted
-    return Match(q, names_of_all, left, Status.OK if left < 1e-6 else Status.NO_CONVERGENCE)
+    rows = [model.index(n) for n in names]
 
+    def adjusted(steps: Array) -> Array:
+        q = p.copy()
+        q[rows] *= np.exp(steps)
+        return _levelled(model, q, goal)
 
-def _miss(model: GeneratedModel, p: Array, goal: Observables) -> Array | None:
-    """Return the logarithms of slope, load and frequency over their goals."""
-    here = observe(model, p, goal.V)
-    if here is None:
-        return None
-    return np.log([here.slope / goal.slope, here.W0 / goal.W0, here.Omega / goal.Omega])
+    def misses(steps: Array) -> Array:
+        """Return the logarithms of slope, load and frequency over their goals."""
+        here = observe(model, adjusted(steps), goal.V)
+        if here is None:  # outside of the velocity-weakening regime
+            return np.full(3, OUTSIDE)
+        return np.log([here.slope / goal.slope, here.W0 / goal.W0, here.Omega / goal.Omega])
+
+    with np.errstate(all="ignore"):  # a trial far off may overflow
+        q = adjusted(root(misses, np.zeros(3), tol=TOLERANCE).x)
+    reached, left = observe(model, q, goal.V), np.inf
+    if reached is not None:
+        own = ("slope", "W0", "Omega", "friction") if FRICTION_LEVEL in model.names else ("slope", "W0", "Omega")
+        left = max(abs(getattr(reached, name) / getattr(goal, name) - 1) for name in own)
+    every = (*names, FRICTION_LEVEL) if FRICTION_LEVEL in model.names else tuple(names)
+    return Match(q, every, left, Status.OK if left < 1e-6 else Status.NO_CONVERGENCE)
 
 
 def _levelled(model: GeneratedModel, p: Array, goal: Observables) -> Array:
     """Return `p` with mu0, if there is one, such that friction at the goal's velocity is the goal's: mu0 may not be additive."""
+    from scipy.optimize import newton
+
     if FRICTION_LEVEL not in model.names:
-        return p.copy()
+        return p
     q = model.with_values(p, V=goal.V, W0=goal.W0)
 
     def off(value: float) -> float:
         return _friction(model, model.with_values(q, **{FRICTION_LEVEL: value})) - goal.friction
 
-    a = float(p[model.index(FRICTION_LEVEL)])
-    fa = off(a)
-    for _ in range(30):
-        h = 1e-6 * max(abs(a), 1e-3)
-        slope = (off(a + h) - fa) / h
-        if slope == 0:
-            break
-        a -= fa / slope
-        fa = off(a)
-        if abs(fa) < 1e-14:
-            break
-    return model.with_values(p, **{FRICTION_LEVEL: a})
+    level = newton(off, float(p[model.index(FRICTION_LEVEL)]), tol=1e-15, disp=False)
+    return model.with_values(p, **{FRICTION_LEVEL: float(level)})
 
 
 # One law's boundaries at several amplitudes, and what two laws' boundaries say of each other.
