@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -132,31 +133,26 @@ def _free_start(
         x[iv] += np.clip(step, -3.0, 3.0)
         if abs(step) < 1e-13 * (1 + abs(x[iv])):
             break
-    x = x.real
-    of_state = [float(derivative(lambda y: model.friction(y, V, W, 0.0, p.astype(complex)), x, i)) for i in range(x.size)]
-    S = np.zeros((x.size, len(by)))
-    for k, name in enumerate(by):
-        own = name.partition(f"{run.name}.")[2]
-        if own == "mu":
-            S[iv, k] = 1 / of_state[iv]
-        elif own in ages:
-            S[states.index(own), k] = 1.0
-            S[iv, k] = -of_state[states.index(own)] / of_state[iv]
+    x, slope = x.real, found.imag / COMPLEX_STEP
+    stiffness = model.namespace.get("stiffness") or (lambda x, V, W, W_dot, p: p[model.index("K")])
+
+    def balanced(name: str) -> ComplexArray:
+        """Return the state with a complex step of one quantity, to first order; of none where the name is not one's of here."""
+        y, q, own, step = x.astype(complex), p.astype(complex), name.partition(f"{run.name}.")[2], 1j * COMPLEX_STEP
+        if own in ages:
+            y[states.index(own)] += step
         elif name in indices:
-            S[iv, k] = -derivative(lambda q: model.friction(x.astype(complex), V, W, 0.0, q), p, indices[name]) / of_state[iv]
-    if "u" in states:
-        stiffness = model.namespace.get("stiffness") or (lambda x, V, W, W_dot, p: p[model.index("K")])
-        K, u = float(stiffness(x, V, W, 0.0, p)), states.index("u")
-        x[u] = W * mu / K
-        for k, name in enumerate(by):
-            if name == f"{run.name}.mu":
-                S[u, k] = W / K
-            elif name in indices:
-                S[u, k] = -W * mu / K**2 * derivative(lambda q: stiffness(x, V, W, 0.0, q), p, indices[name])
-    if "z" in states:
-        x[states.index("z")] = np.exp(x[iv])
-        S[states.index("z")] = np.exp(x[iv]) * S[iv]
-    return x, S
+            q[indices[name]] += step
+        friction = mu + (step if own == "mu" else 0.0)
+        y[iv] += (friction - model.friction(y, V, W, 0.0, q)) / slope
+        if "u" in states:
+            y[states.index("u")] = W * friction / stiffness(y, V, W, 0.0, q)
+        if "z" in states:
+            y[states.index("z")] = np.exp(y[iv])
+        return y
+
+    columns = [balanced(name).imag / COMPLEX_STEP for name in by]
+    return balanced("").real, np.array(columns).T if columns else np.zeros((x.size, 0))
 
 
 def derivative(function: Callable[[ComplexArray], ComplexArray], p: Array, place: int) -> Array:
@@ -212,14 +208,9 @@ def effect_inputs(run: Run) -> dict[str, float]:
 
 def _modulation(run: Run) -> dict[str, float]:
     """Return the modulation of a run's load, that of the whole run where this is a part of one."""
-    known = _MODULATIONS.get(id(run.load))
-    if known is not None and known[0] is run.load:
-        return known[1]
-    answer = modulation_of(run.load, run.t)
-    _MODULATIONS[id(run.load)] = (run.load, answer)
-    while len(_MODULATIONS) > 64:
-        _MODULATIONS.pop(next(iter(_MODULATIONS)))
-    return answer
+    if run.load not in _MODULATIONS:
+        _MODULATIONS[run.load] = modulation_of(run.load, run.t)
+    return _MODULATIONS[run.load]
 
 
 def modulation_of(load: Load, t: Array) -> dict[str, float]:
@@ -256,7 +247,7 @@ def _switched(t: Array, W: Array, f: float, eps: float, onset: float) -> dict[st
     return {"eps": float(x[0]), "psi": float(x[1]), "onset0": float(x[2]), "rise0": max(abs(float(x[3])), 1e-4)}
 
 
-_MODULATIONS: dict[int, tuple[Load, dict[str, float]]] = {}  # it is asked for at every prediction
+_MODULATIONS: WeakKeyDictionary[Load, dict[str, float]] = WeakKeyDictionary()  # it is asked for at every prediction
 
 
 def stiffness_share(experiment: Experiment, run: Run) -> float:
