@@ -257,9 +257,9 @@ def solve_block(task: TileTask, model: GeneratedModel) -> Samples:
     block = _Block(model, OrbitBatch.empty(p, start.orbit.edges, len(model.states)), tol)
     block.orbits.replace((c, r), start)
     for level in range(1, len(rows)):
-        block.fill_rows(columns[0], np.sort(np.concatenate(rows[:level])), rows[level])
+        block.fill(columns[0], rows[level], np.sort(np.concatenate(rows[:level])), 1)
     for level in range(1, len(columns)):
-        block.fill_columns(np.sort(np.concatenate(columns[:level])), columns[level])
+        block.fill(columns[level], np.arange(task.shape[1]), np.sort(np.concatenate(columns[:level])), 0)
     block.spread()
     every = _pairs(*map(np.arange, task.shape))
     found = block.orbits.part(every)
@@ -304,21 +304,14 @@ class _Block:
     orbits: OrbitBatch
     tol: float
 
-    def fill_rows(self, columns: Array, known: Array, new: Array) -> None:
-        """Solve the orbits at rows `new` of `columns` from those at the rows `known`."""
-        c, r = _pairs(columns, new)
-        index, weights = neighbours(known, r)
-        self._fill(c, r, combined(self.orbits.orbit.part((c[:, None], known[index])), weights))
-
-    def fill_columns(self, known: Array, new: Array) -> None:
-        """Solve the orbits at columns `new` from those at the columns `known`."""
-        c, r = _pairs(new, np.arange(self.orbits.converged.shape[1]))
-        index, weights = neighbours(known, c)
-        self._fill(c, r, combined(self.orbits.orbit.part((known[index], r[:, None])), weights))
-
-    def _fill(self, c: Array, r: Array, guess: Discretisation) -> None:
-        """Store the orbits at columns `c`, rows `r` from `guess`, also those that do not converge."""
-        self.orbits.replace((c, r), regular_orbits(self.model, self.orbits.p[:, c, r], guess, self.tol))
+    def fill(self, columns: Array, rows: Array, known: Array, axis: int) -> None:
+        """Solve the orbits at `columns` and `rows` from those at the columns (`axis` 0) or rows (1) `known`; keep all."""
+        place = _pairs(columns, rows)
+        index, weights = neighbours(known, place[axis])
+        beside = [along[:, None] for along in place]
+        beside[axis] = known[index]
+        guess = combined(self.orbits.orbit.part(tuple(beside)), weights)
+        self.orbits.replace(place, regular_orbits(self.model, self.orbits.p[:, *place], guess, self.tol))
 
     def spread(self) -> None:
         """Solve the orbits that were not found from those beside them, again and again until none is added.
