@@ -55,10 +55,6 @@ class FreeParameter:
         """Return the coordinate of a value in base units."""
         return math.log(value / self.start) if self.log else (value - self.start) / self.size
 
-    def rate(self, value: float) -> float:
-        """Return d(value)/dy."""
-        return value if self.log else self.size
-
     def declared(self, value: float) -> float:
         """Return a value in base units in the unit the parameter is declared in."""
         return from_base(value, self.parameter.unit)
@@ -87,7 +83,7 @@ class Scale:
 
     def rates(self, y: Array) -> Array:
         """Return d(value)/dy (k,) at coordinates (k,)."""
-        return np.array([q.rate(q.value(float(c))) for q, c in zip(self.free, y, strict=True)])
+        return np.array([value if q.log else q.size for q, value in zip(self.free, self.values(y), strict=True)])
 
     @property
     def bounds(self) -> tuple[Array, Array]:
