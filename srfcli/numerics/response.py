@@ -66,16 +66,13 @@ def linear_response(model: GeneratedModel, p: Array) -> LinearResponse:
 
 def _observed(model: GeneratedModel, name: str, rest: Array, p: Array, state: ComplexArray) -> ComplexArray:
     """Return the first-order change of the model's function `name` with the state and with eps itself."""
-    function, total = model.namespace[name], np.zeros(rest.shape[:-1], dtype=complex)
-    for k in range(rest.shape[-1]):
-        moved = rest.astype(complex)
-        moved[..., k] += 1j * COMPLEX_STEP
-        total += function(0.0, moved, p).imag / COMPLEX_STEP * state[..., k]
-    q = p.astype(complex)
-    q[model.index("eps")] += 1j * COMPLEX_STEP
-    whole = rest.astype(complex)
-    direct = [np.asarray(function(tau, whole, q)).imag / COMPLEX_STEP for tau in (0.0, 0.25)]
-    return total + direct[0] - 1j * direct[1]
+    function, q, step = model.namespace[name], p.astype(complex), 1j * COMPLEX_STEP
+    q[model.index("eps")] += step
+    along, across = (
+        np.asarray(function(tau, rest + step * part, q)).imag / COMPLEX_STEP
+        for tau, part in ((0.0, state.real), (0.25, -state.imag))
+    )
+    return np.asarray(along - 1j * across)
 
 
 def resonance(frequencies: Array, amplitude: Array) -> tuple[float, float] | None:
