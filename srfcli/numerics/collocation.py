@@ -14,7 +14,7 @@ import ctypes
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -200,7 +200,7 @@ class Discretisation:
     @property
     def phases(self) -> Array:
         """Return tau at the Gauss points, (N, m)."""
-        return _frame(self.edges.tobytes(), self.x.shape[-1]).phases
+        return self.edges[:-1, None] + self.steps[:, None] * gauss().nodes
 
     @property
     def weights(self) -> Array:
@@ -275,27 +275,6 @@ def stage_parameters(p: Array) -> list[float] | Array:
     return p.tolist() if p.ndim == 1 else p[..., None, None]
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """What the collocation equations on one mesh have in common at all points."""
-
-    phases: Array  # (N, m)
-    inverse: Array  # (N, m, m), the inverse collocation matrix over the step
-    block: Array  # (N, m, n, m, n), the same times the identity
-    first: Array  # (N, m n, n), the response's right side for the interval's first state
-
-
-@lru_cache(maxsize=64)
-def _frame(edges: bytes, n: int) -> _Frame:
-    mesh = np.frombuffer(edges)
-    h = np.diff(mesh)
-    scheme = gauss()
-    inverse = scheme.inverse / h[:, None, None]
-    block = inverse[:, :, None, :, None] * np.eye(n)[:, None, :]
-    first = (inverse.sum(axis=-1)[..., None, None] * np.eye(n)).reshape(len(h), -1, n)
-    return _Frame(mesh[:-1, None] + h[:, None] * scheme.nodes, inverse, block, first)
-
-
 def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tuple[str, ...] = ()) -> Condensed:
     """Return the linearisation of the collocation equations about `orbit`, with columns for the parameters `names`.
 
@@ -304,18 +283,17 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     x, X = orbit.x, orbit.stages
     m, n = X.shape[-2:]
     k, size, batch = len(names), m * n, X.shape[:-2]  # batch includes the intervals
-    step = gauss().step
-    frame = _frame(orbit.edges.tobytes(), n)
-    tau, ps = frame.phases, stage_parameters(p)
+    step, inverse = gauss().step, gauss().inverse / orbit.steps[:, None, None]
+    tau, ps = orbit.phases, stage_parameters(p)
     block = np.empty((*batch, m, n, m, n))
-    block[...] = frame.block
+    block[...] = inverse[:, :, None, :, None] * np.eye(n)[:, None, :]
     diagonal = np.einsum("...jajb->...jab", block)
     diagonal -= model.cycle_jacobian(tau, X, ps)
     block = block.reshape(*batch, size, size)
     away = X - x[..., None, :]
     right = np.empty((*batch, size, n + 1 + k))
-    right[..., :n] = frame.first
-    right[..., n] = (model.cycle(tau, X, ps) - frame.inverse @ away).reshape(*batch, size)
+    right[..., :n] = (inverse.sum(axis=-1)[..., None, None] * np.eye(n)).reshape(-1, size, n)
+    right[..., n] = (model.cycle(tau, X, ps) - inverse @ away).reshape(*batch, size)
     for column, name in enumerate(names):
         right[..., n + 1 + column] = model.cycle_parameter(name)(tau, X, ps).reshape(*batch, size)
     local = solved(block, right)
@@ -348,7 +326,8 @@ def log_determinant(condensed: Condensed, orbit: Discretisation) -> float:
     """
     n, step = orbit.x.shape[-1], gauss().step
     r = 1 - step.sum()
-    outer = _frame(orbit.edges.tobytes(), n).first @ np.kron(step, np.eye(n)) / r
+    first = gauss().inverse.sum(axis=-1) / orbit.steps[:, None]
+    outer = np.stack([np.kron(np.outer(row, step), np.eye(n)) for row in first]) / r
     above = np.linalg.slogdet(condensed.block + outer)[1]
     return float((above - np.linalg.slogdet(condensed.block)[1] + n * np.log(abs(r))).sum())
 
