@@ -21,7 +21,7 @@ from srfcli.data.description import RunDescription
 from srfcli.data.noise import NOISE_SAMPLES, deviations, quantisation, saturation, spikes, white_level
 from srfcli.data.values import OBSERVABLES, Declared
 from srfcli.laws.registry import Registry
-from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation, SampledLoad, UnknownLoad
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation, SampledLoad, UnknownLoad, runs_of
 
 # The driving velocity of a run: from its description, from a column of velocities, or from one of displacements.
 
@@ -820,9 +820,7 @@ def load_from_column(place: Place, W: Array, unit: str = "N") -> tuple[Load, lis
 def _pressed(t: Array, W: Array) -> tuple[float, float] | None:
     """Return the longest time (s) in which the loads W (n,) are those of a contact, None where there is none."""
     low = PRESSED * float(np.median(W))  # less is loading and unloading
-    ends = np.flatnonzero(np.diff((max(low, NO_CONTACT) < W).astype(int), prepend=0, append=0)).reshape(-1, 2)
-    spans = [(float(t[b - 1] - t[a]), a, b - 1) for a, b in ends.tolist()]
-    length, first, last = max(spans, default=(0.0, 0, 0))
+    length, first, last = max(((t[b] - t[a], a, b) for a, b in runs_of(max(low, NO_CONTACT) < W)), default=(0.0, 0, 0))
     return (float(t[first]), float(t[last])) if length > 0 else None
 
 

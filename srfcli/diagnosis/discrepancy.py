@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from math import floor, isfinite, log10
 from pathlib import Path
 from typing import Any
@@ -136,16 +135,8 @@ ORIGIN = "terms"
 def with_terms(registry: Registry) -> Registry:
     """Return the registry with the candidate terms besides; one whose name is taken is left out."""
     taken = {e.name for e in registry.entries("effect")}
-    return registry.plus(e for e in _term_entries() if e.name not in taken)
-
-
-@lru_cache(maxsize=1)
-def _term_entries() -> tuple[Entry, ...]:
-    found = []
-    for path in sorted(TERMS_FOLDER.glob("*.toml")):
-        kind, name, about = read_header(path)
-        found.append(Entry(name, kind, ORIGIN, path, about))
-    return tuple(found)
+    headers = [(path, *read_header(path)) for path in sorted(TERMS_FOLDER.glob("*.toml"))]
+    return registry.plus(Entry(name, kind, ORIGIN, path, about) for path, kind, name, about in headers if name not in taken)
 
 
 def best_closed_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:

@@ -26,6 +26,7 @@ from srfcli.inference.kalman import Innovations
 from srfcli.inference.noise import stretches
 from srfcli.inference.prediction import effect_inputs
 from srfcli.inference.recordings import slip_along
+from srfcli.motion.imposed import runs_of
 from srfcli.motion.simulate import stick_slip
 
 # Where recording and baseline part: runs and times, phases of forcing and stick-slip, frequencies, quantities of state.
@@ -151,10 +152,8 @@ def _dense(piece: RunResiduals, m: Array, expected_squares: Array) -> tuple[tupl
     taken[order[:count]] = True
     closed = taken.copy()
     closed[1:-1] |= taken[:-2] & taken[2:]  # a single cell between two that count is no gap
-    steps = np.diff(np.concatenate([[0], closed.astype(int), [0]]))
-    spans = list(zip(np.nonzero(steps > 0)[0].tolist(), np.nonzero(steps < 0)[0].tolist(), strict=True))
-    best = sorted(spans, key=lambda s: -float(excess[s[0] : s[1]].sum()))[:MAX_NAMED]
-    return tuple(sorted((float(piece.t[edges[a]]), float(piece.t[edges[b] - 1])) for a, b in best))
+    best = sorted(runs_of(closed), key=lambda s: -float(excess[s[0] : s[1] + 1].sum()))[:MAX_NAMED]
+    return tuple(sorted((float(piece.t[edges[a]]), float(piece.t[edges[b + 1] - 1])) for a, b in best))
 
 
 def _phase(rows: Sequence[ScanStatistic]) -> tuple[float, float] | None:
