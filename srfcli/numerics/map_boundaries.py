@@ -209,21 +209,17 @@ def _fold(curve: Curve) -> Array:
 
 def _dense(curve: Curve) -> _Traced:
     """Return the cubics through the points and tangents of a curve, each sampled DENSE times."""
+    from scipy.interpolate import CubicHermiteSpline
+
     q = curve.q
     t = np.array([pt.tangent_q for pt in curve.points])
     unit = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
-    chord = np.linalg.norm(np.diff(q, axis=0), axis=1)[:, None, None]
-    s = (np.arange(DENSE) / DENSE)[None, :, None]
-    a, b, ta, tb = q[:-1, None], q[1:, None], unit[:-1, None], unit[1:, None]
-    # a curve whose tangents point against its order (traced backwards) keeps its sign throughout
-    sign = np.sign((unit[:-1] * np.diff(q, axis=0)).sum(axis=1))[:, None, None]
-    line = (
-        (2 * s**3 - 3 * s**2 + 1) * a
-        + (s**3 - 2 * s**2 + s) * chord * sign * ta
-        + (3 * s**2 - 2 * s**3) * b
-        + (s**3 - s**2) * chord * sign * tb
-    ).reshape(-1, 2)
-    line = np.concatenate([line, q[-1:]])
+    steps = np.diff(q, axis=0)
+    chord = np.maximum(np.linalg.norm(steps, axis=1), 1e-12)
+    reached = np.concatenate([[0.0], np.cumsum(chord)])
+    sign = np.sign((unit[:-1] * steps).sum())  # a curve that was traced backwards has tangents against its order
+    places = np.append(reached[:-1, None] + chord[:, None] * np.arange(DENSE) / DENSE, reached[-1])
+    line = CubicHermiteSpline(reached, q, sign * unit)(places)
     along_line = np.gradient(line, axis=0)
     left = np.stack([-along_line[:, 1], along_line[:, 0]], axis=1)
     side = unstable_side(curve)  # the same all along
