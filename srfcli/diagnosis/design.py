@@ -15,6 +15,7 @@ motion itself in place of its derivatives.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
@@ -334,13 +335,9 @@ def _sufficient_duration(losses: Sequence[LackOfFit], trial: PredictedRun) -> tu
         for k in np.unique(np.linspace(0, n, DURATION_TRIALS + 1).astype(int)[1:]).tolist():
             if min(x.gain(samples=k) for x in losses) >= DISCRIMINATING_GAIN:
                 return float(trial.run.t[k - 1] - trial.run.t[0]), 1
-    low, high = 1, MAX_REPEATS
-    if min(x.gain(times=high) for x in losses) < DISCRIMINATING_GAIN:
-        return None, None
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if min(x.gain(times=middle) for x in losses) >= DISCRIMINATING_GAIN else (middle, high)
-    return high * trial.proposal.duration, high
+    several = range(2, MAX_REPEATS + 1)
+    repeats = 2 + bisect_left(several, True, key=lambda n: min(x.gain(times=n) for x in losses) >= DISCRIMINATING_GAIN)
+    return (repeats * trial.proposal.duration, repeats) if repeats in several else (None, None)
 
 
 # Runs that an apparatus could still make: drives and loads drawn around those that it has shown.
