@@ -227,13 +227,12 @@ def _acting(entry: Node, parameter: Parameter, geometry: Geometry) -> tuple[tupl
         if other is not None:
             other.fail("it acts in all runs", 'Name those where it does: runs = ["slow"], or leave elsewhere out.')
         return (), 0.0
-    if not isinstance(listed.value, list) or not listed.value:
-        listed.expected("a list of runs", 'Write runs = ["slow"].')
+    runs = listed.items("runs", 'Write runs = ["slow"].', fewest=1)
     if parameter.name in ("K", "M"):
         listed.fail(f"{parameter.name} is the apparatus', and no run's own", "Leave runs out.")
     if other is None:
         entry.fail(f"nothing says what {parameter.name} is in the other runs", "Write elsewhere = 0, or what it is there.")
-    return tuple(listed.child(i).text() for i in range(len(listed.value))), _stated(other, parameter, geometry)
+    return tuple(run.text() for run in runs), _stated(other, parameter, geometry)
 
 
 def _stated(node: Node, parameter: Parameter, geometry: Geometry) -> float:

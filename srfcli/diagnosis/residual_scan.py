@@ -426,11 +426,7 @@ class ResidualScan:
             if self.root is not None:
                 track = self.root @ rng.standard_normal((self.root.shape[1], d))
                 noise = [e + p.X @ track[p.indices] for p, e in zip(self.pieces, noise, strict=True)]
-            M = self.projected(noise)
-            smallest = np.zeros(d)
-            for _, _, _, log_p in self._evaluated(M):
-                smallest = np.minimum(smallest, log_p.min(axis=0))
-            found += smallest.tolist()
+            found += np.min([log_p.min(axis=0) for *_, log_p in self._evaluated(self.projected(noise))], axis=0).tolist()
         return np.sort(np.array(found))
 
     def rows(self, M: Sequence[Array], null: Array) -> list[ScanStatistic]:
