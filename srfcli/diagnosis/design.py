@@ -107,11 +107,6 @@ class RivalModel:
         return cls(fitted, tuple(likelihood.names[i] for i in kept), scale, own * np.outer(scale, scale))
 
     @property
-    def name(self) -> str:
-        """Return the hypothesis' name."""
-        return self.fitted.name
-
-    @property
     def problem(self) -> Problem:
         """Return the problem that was fitted."""
         return self.fitted.fit.likelihood.problem
@@ -242,7 +237,7 @@ class Design:
             found = rival.predicted(run)
             if found is None:
                 return None
-            y[rival.name] = found
+            y[rival.fitted.name] = found
         losses = self.losses(y, lambda wrong, shown: wrong.lack_of_fit(run, shown, slopes=False))
         if losses is None:
             return None
@@ -257,10 +252,10 @@ class Design:
         """
         found = {}
         for true, wrong in self.pairs:
-            lost = lack(wrong, y[true.name])
+            lost = lack(wrong, y[true.fitted.name])
             if lost is None:
                 return None
-            found[true.name, wrong.name] = lost
+            found[true.fitted.name, wrong.fitted.name] = lost
         return found
 
     def stably_started(self, proposal: Proposal) -> tuple[Proposal, Run] | None:
@@ -285,7 +280,7 @@ class Design:
         worth = {pair: lost.gain() for pair, lost in losses.items()}
         true_name, wrong_name = min(worth, key=lambda pair: worth[pair])
         seconds, repeats = _sufficient_duration(list(losses.values()), trial)
-        names, run = tuple(s.name for s in self.rivals), trial.run
+        names, run = tuple(s.fitted.name for s in self.rivals), trial.run
         wrong = self.rivals[names.index(wrong_name)]
         noise = float(wrong.values()[wrong.fitted.fit.likelihood.gauges(run)[0]["gauge_white"]])
         first, second = sorted((true_name, wrong_name), key=names.index)

@@ -69,7 +69,7 @@ class _Column:
     inner: dict[str, float]
     columns: Array
     whole: float = 0.0
-    coefficients: Array | None = None
+    coefficients: Array = field(default_factory=lambda: np.zeros((0, 0)))
     along: Array | None = None
 
     @property
@@ -415,7 +415,6 @@ class Scores:
         least: dict[str, tuple[float, _Column]] = {}
         others = self.projection.basis_without(names)
         for column in self.columns:
-            assert column.coefficients is not None
             left, own = float(np.sum(column.columns**2)), column.coefficients - others @ (others.T @ column.coefficients)
             absorbed = float(np.sum(own**2))
             share = left / max(left + absorbed, 1e-300)
@@ -430,11 +429,11 @@ class Scores:
         error = float(np.sqrt(max(covariance[0, 0], 0.0)))
         direction = column.columns @ size
         norm = float(np.linalg.norm(direction))
-        shifts = np.zeros(0) if column.coefficients is None else self.projection.shifts(column.coefficients @ size)
+        shifts = self.projection.shifts(column.coefficients @ size).tolist()
         return Score(
             column.effect, gain, self._expected_values(column, size), float(size[0]), error, error * np.sqrt(24.0),
             column.tolerance, direction / norm if norm > 0 else direction,
-            dict(zip(self.fitted.likelihood.names, shifts.tolist(), strict=False)),
+            dict(zip(self.fitted.likelihood.names, shifts, strict=True)),
         )  # fmt: skip
 
     def _admissible(self, column: _Column, size: Array) -> bool:
