@@ -553,11 +553,11 @@ def crossing_numbers(model: GeneratedModel, boundary: Boundary) -> list[list[int
     lowest = [bool(s.g[np.isfinite(s.g)][0] < 0) if np.isfinite(s.g).any() else True for s in boundary.scans]
     first = 1 if all(lowest) or not lowest else 2
     numbers: list[list[int | None]] = []
-    for b, (branch, own) in enumerate(zip(boundary.branches, lines, strict=True)):
+    for branch, own in zip(boundary.branches, lines, strict=True):
         row: list[int | None] = []
         for i, point in enumerate(branch.points):
-            below = sum(_crossings_below(q, own[i], skip=i if k == b else None) for k, q in enumerate(lines))
-            number = first + below
+            x, y = own[i]
+            number = first + sum(int((passes(q, x)[1] < y - 1e-12).sum()) for q in lines)  # the point itself is not below
             losing = point.slope > 0
             if (number % 2 == 1) != losing:
                 number += 1 if _other_side_below(branch, own, i) else -1
@@ -565,15 +565,6 @@ def crossing_numbers(model: GeneratedModel, boundary: Boundary) -> list[list[int
             row.append(max(number, 1) if told else None)
         numbers.append(row)
     return numbers
-
-
-def _crossings_below(q: Array, at: Array, *, skip: int | None) -> int:
-    """Return how often the polyline `q` passes x = at[0] below y = at[1]; segments touching point `skip` do not count."""
-    segments, heights = passes(q, at[0])
-    counted = heights < at[1]
-    if skip is not None:
-        counted &= (segments != skip - 1) & (segments != skip)
-    return int(counted.sum())
 
 
 def _other_side_below(branch: Branch, q: Array, i: int) -> bool:
