@@ -20,7 +20,7 @@ from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.thresholds import Thresholds
 from srfcli.inference.free_parameters import RHO, Scale
 from srfcli.inference.profile import CHI2_95, Interval, Refits, interval_end, quadratic
-from srfcli.numerics.boundary import CHUNK, BoundaryPoint, along, linearise_boundary, polish
+from srfcli.numerics.boundary import CHUNK, BoundaryPoint, along, growth_slopes, linearise_boundary, polish
 from srfcli.numerics.collocation import by_mesh, join
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import HopfPoint, by_frequency_and_load, characteristic_slopes, hopf_points, steady_is_stable
@@ -273,13 +273,12 @@ def forced_slopes(model: GeneratedModel, points: Sequence[BoundaryPoint], names:
     Exact for the discretised problem, so within the points' mesh error of the true ones; infinite at a fold of the
     crossings, where two meet.
     """
-    slopes, n = np.full((len(points), len(names)), np.nan), len(model.states)
+    slopes = np.full((len(points), len(names)), np.nan)
     for index in by_mesh([q.orbit for q in points], CHUNK):
         here = [points[i] for i in index]
         p, rho = np.stack([q.p for q in here], axis=1), np.array([q.rho for q in here])
         linear = linearise_boundary(model, p, join([q.orbit for q in here]), (*names, "W0"), rho)
-        response = np.linalg.solve(linear.periodic[..., :n], linear.periodic[..., n + 1 :])  # -dx_0/dq
-        total = linear.growth[..., n + 1 :] - np.einsum("bn,bnk->bk", linear.growth[..., :n], response)
+        total = growth_slopes(linear)
         with np.errstate(divide="ignore"):
             slopes[index] = -total[:, :-1] / total[:, -1:]
     return slopes

@@ -182,11 +182,11 @@ def _growth_row(
     return row_total
 
 
-def slope_in_last(linear: BoundaryLinear) -> Array:
-    """Return d ln|rho| / d(last parameter) along the branch of orbits, the other parameters fixed, (...,); NaN at its fold."""
+def growth_slopes(linear: BoundaryLinear) -> Array:
+    """Return d ln|rho| / d(parameters) (..., k) along the branch of orbits, each with the others fixed; NaN at its fold."""
     n = linear.periodic.shape[-2]
-    response = solved(linear.periodic[..., :n], linear.periodic[..., -1:])[..., 0]
-    return linear.growth[..., -1] - np.einsum("...n,...n->...", linear.growth[..., :n], response)
+    response = solved(linear.periodic[..., :n], linear.periodic[..., n + 1 :])  # -dx_0/dq
+    return linear.growth[..., n + 1 :] - np.einsum("...n,...nk->...k", linear.growth[..., :n], response)
 
 
 # Boundary points to full precision: Newton's method in one parameter, then meshes doubled until the error is met.
@@ -375,7 +375,7 @@ def _step(model: GeneratedModel, r: _Polished, index: Array, direction: Directio
     enough = np.maximum(0.1 * tol, 0.1 * mesh_error(model, part))  # a tenth of the mesh's own error
     done = usable & (left < enough) & (size < 1e-3)
     r.residual[index] = np.where(done, left, np.abs(linear.g))
-    r.slope[index] = slope_in_last(linear) * q[rows[-1]]
+    r.slope[index] = growth_slopes(linear)[..., -1] * q[rows[-1]]
     r.converged[index[done]] = True
     return index[usable & ~done]
 
@@ -392,7 +392,7 @@ def _renew(model: GeneratedModel, r: _Polished, direction: Direction, tol: float
         linear = linearise_boundary(model, q, r.orbit.part(here), direction.names, r.rho[here])
         r.rho[here] = linear.rho
         r.others[here] = largest_other(linear.multipliers, linear.rho)
-        r.slope[here] = slope_in_last(linear) * q[model.index(direction.names[-1])]
+        r.slope[here] = growth_slopes(linear)[..., -1] * q[model.index(direction.names[-1])]
 
 
 def largest_other(multipliers: ComplexArray, rho: ComplexArray) -> Array:

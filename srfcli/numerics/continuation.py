@@ -19,7 +19,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.numerics.boundary import BoundaryPoint, Direction, largest_other, polish, slope_in_last, solve_boundary
+from srfcli.numerics.boundary import BoundaryPoint, Direction, growth_slopes, largest_other, polish, solve_boundary
 from srfcli.numerics.collocation import Discretisation, mesh_error
 from srfcli.numerics.critical import INTERVALS, LineScan, locate_crossings, scan_line
 from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
@@ -122,7 +122,7 @@ def correct(
         changes.append(change)
         q, orbit, rho = q + dq, orbit + step, complex(linear.rho[0])
         if change < max(tol, min(np.sqrt(tol), STALE_TANGENT * reach)):  # a full Newton step leaves an error of order change^2
-            others, slope = float(largest_other(linear.multipliers, linear.rho)[0]), float(slope_in_last(linear)[0])
+            others, slope = float(largest_other(linear.multipliers, linear.rho)[0]), float(growth_slopes(linear)[0, -1])
             found = CurvePoint(q, plane.point(model, q), orbit, rho, others, tangent_q, tangent, slope, correction=changes[0])
             return _normalised(model, found, orientation)
     return None
