@@ -390,8 +390,7 @@ class _Whittle:
         """Return x with one more process that takes half of the variance; first, where a line stands out, then elsewhere."""
         places: list[tuple[float, ...]]
         if kind == "relaxation":
-            places = [(share * np.log(self.calm.window.n),) for share in CORRELATION_TIMES]
-            places = [(np.log(self.spacing) + p[0],) for p in places]
+            places = [(np.log(self.spacing) + share * np.log(self.calm.window.n),) for share in CORRELATION_TIMES]
         else:
             white, colours = self.split(x, kinds)
             over = self.calm.mean / self.expected(GaugeNoise(white, self.quantum, tuple(colours)))

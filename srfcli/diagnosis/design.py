@@ -466,13 +466,11 @@ def _velocities(runs: Sequence[Run]) -> tuple[float, ...]:
     """Return the velocities of driving that runs have shown, in um/s."""
     found: set[float] = set()
     for run in runs:
-        if len(run.drive.velocities) <= MANY_VELOCITIES and not any(run.drive.accelerations):
-            found |= {float(f"{V:.3g}") for V in run.drive(run.t).tolist() if V > 0}
-        else:
-            V = run.drive(run.t)
-            V = V[V > 0]
-            shares = np.linspace(0.05, 0.95, MANY_VELOCITIES)
-            found |= {float(f"{x:.3g}") for x in np.quantile(V, shares).tolist()} if V.size else set()
+        V = run.drive(run.t)
+        V = V[V > 0]
+        if V.size and (len(run.drive.velocities) > MANY_VELOCITIES or any(run.drive.accelerations)):
+            V = np.quantile(V, np.linspace(0.05, 0.95, MANY_VELOCITIES))
+        found |= {_digits(x) for x in V.tolist()}
     return tuple(sorted(found))
 
 

@@ -12,7 +12,6 @@ from srfcli.numerics.collocation import (
     STAGES,
     Discretisation,
     condense,
-    gauss,
     last_coefficient,
     log_determinant,
     mesh_error,
@@ -208,9 +207,8 @@ def waveforms(model: GeneratedModel, p: Array, orbit: Discretisation, samples: i
 
 def _harmonics(orbit: Discretisation, values: Array, count: int) -> ComplexArray:
     """Return c_0..c_count of values (N, m) at the Gauss points, by their quadrature: the mean, then amplitudes with phases."""
-    weighted = values * orbit.steps[:, None] * gauss().weights
     waves = np.exp(-2j * np.pi * np.arange(count + 1)[:, None, None] * orbit.phases)
-    amplitudes = (waves * weighted).sum(axis=(-1, -2))
+    amplitudes = (waves * (values * orbit.weights)).sum(axis=(-1, -2))
     amplitudes[1:] *= 2
     return amplitudes
 
@@ -222,7 +220,7 @@ def _liouville(model: GeneratedModel, p: Array, orbit: Discretisation) -> float:
     is far below rounding against 1, but not by its right factor.
     """
     trace = np.trace(model.cycle_jacobian(orbit.phases, orbit.stages, stage_parameters(p)), axis1=-2, axis2=-1)
-    exponents = (trace @ gauss().weights) * orbit.steps
+    exponents = (trace * orbit.weights).sum(axis=-1)
     if np.abs(exponents).max() > STIFF:
         return float("nan")
     return float(abs(np.expm1(log_determinant(condense(model, p, orbit), orbit) - exponents.sum())))
