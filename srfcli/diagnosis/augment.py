@@ -312,9 +312,7 @@ def law_files(laws: MergedLaws, values: Mapping[str, float]) -> dict[str, str]:
 
 
 def _name(name: str, suffix: str) -> str:
-    stem = name
-    for word in ("-augmented", "-fitted"):
-        stem = stem.removesuffix(word)
+    stem = name.removesuffix("-augmented").removesuffix("-fitted")
     return f"{stem[:50].rstrip('-')}-{suffix}"
 
 

@@ -390,13 +390,13 @@ class ResidualScan:
         self.inverse = root @ root.T
         if kept:
             self.root, self.inverse = root, -self.inverse
-        self.expected_squares = [1 - np.einsum("ij,jk,ik->i", p.X, self._block(p, p), p.X, optimize=True) for p in self.pieces]
+        self.expected_squares = [1 - np.einsum("ij,jk,ik->i", p.X, self._block(p), p.X, optimize=True) for p in self.pieces]
         self.spectra = [self._spectrum(i) for i in range(len(self.pieces))]
         self.items = [*self._windows(), *self._bins()]
         self.count = sum(i.freedom.size for i in self.items) + sum(s[1].size for s in self.spectra)
 
-    def _block(self, a: RunResiduals, b: RunResiduals) -> Array:
-        return np.asarray(self.inverse[np.ix_(a.indices, b.indices)])
+    def _block(self, p: RunResiduals) -> Array:
+        return np.asarray(self.inverse[np.ix_(p.indices, p.indices)])
 
     def projected(self, residuals: Sequence[Array]) -> list[Array]:
         """Return M r by run, r (n,) or (n, d)."""
@@ -483,7 +483,7 @@ class ResidualScan:
         m = (n - 1) // 2
         f = np.arange(1, m + 1) / (n * step)
         F = np.fft.rfft(p.X[a:b] * _taper(n), axis=0)[1 : m + 1]
-        c, s, block = F.real, -F.imag, self._block(p, p)
+        c, s, block = F.real, -F.imag, self._block(p)
         cc, cs, ss = (np.einsum("ij,ij->i", x @ block, y) for x, y in ((c, c), (c, s), (s, s)))
         half = 0.5 / (n * step)
         item = _StatisticGroup(

@@ -395,9 +395,7 @@ class Scores:
 
     def _normal_equations(self, gram: Array, g: Array) -> tuple[float, Array, Array]:
         d = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        values, vectors = np.linalg.eigh(gram / np.outer(d, d))
-        keep = values > 1e-9 * max(values[-1], 1e-300)
-        inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T / np.outer(d, d)
+        inverse = np.linalg.pinv(gram / np.outer(d, d), rcond=1e-9, hermitian=True) / np.outer(d, d)
         size = inverse @ g
         return 0.5 * float(g @ size), size, inverse
 

@@ -451,15 +451,6 @@ class Cells:
         return self.at[:, None, :] + self.size * CORNERS
 
 
-@dataclass
-class Refined:
-    """The points of a tile with those added, all leaf cells, and the cells in which a boundary may still hide."""
-
-    samples: Samples
-    leaves: list[Cells] = field(default_factory=list)
-    suspect: Array = field(default_factory=lambda: np.zeros((0, 3)))  # lower corner and size, in grid steps
-
-
 class _Points:
     """Samples found by their place; places are whole numbers of finest steps."""
 
@@ -507,25 +498,27 @@ class _Points:
         )
 
 
-def refine(task: TileTask, model: GeneratedModel, samples: Samples) -> Refined:
-    """Return the tile with its cells halved, up to the settings' depth, where a boundary could hide in them."""
+def refine(task: TileTask, model: GeneratedModel, samples: Samples) -> tuple[Samples, list[Cells], Array]:
+    """Return the tile's points with those added, and all leaf cells: halved where a boundary could hide, `depth` times at most.
+
+    The cells in which one still may (S, 3) follow: lower corner and size, in grid steps.
+    """
     unit = 2**task.settings.depth
-    points, result = _Points(samples, unit), Refined(samples)
+    points, leaves, suspect = _Points(samples, unit), list[Cells](), np.zeros((0, 3))
     cells = _grid_cells(task, samples, unit)
     while True:
         corners = points.index(cells.corners())
         wanted = suspects(points.samples.g[corners], cells.error)
-        result.leaves.append(Cells(cells.at[~wanted], cells.size, cells.error[~wanted]))
+        leaves.append(Cells(cells.at[~wanted], cells.size, cells.error[~wanted]))
+        halved = Cells(cells.at[wanted], cells.size, cells.error[wanted])
         if not wanted.any():
             break
         if cells.size == 1:
-            last = cells.at[wanted]
-            result.leaves.append(Cells(last, 1, cells.error[wanted]))
-            result.suspect = np.concatenate([last, np.ones((len(last), 1))], axis=1) / unit
+            leaves.append(halved)
+            suspect = np.concatenate([halved.at, np.ones((len(halved.at), 1))], axis=1) / unit
             break
-        cells = _halved(task, model, points, Cells(cells.at[wanted], cells.size, cells.error[wanted]), corners[wanted])
-    result.samples = points.samples
-    return result
+        cells = _halved(task, model, points, halved, corners[wanted])
+    return points.samples, leaves, suspect
 
 
 def _grid_cells(task: TileTask, samples: Samples, unit: int) -> Cells:
@@ -585,14 +578,12 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
     `discontinuity_axis` (K,), and at it `discontinuity_rho`, `discontinuity_x`, `discontinuity_stages`.
     """
     model = tile_model(task.source, task.key)
-    done = refine(task, model, solve_block(task, model))
-    samples = done.samples
+    samples, leaves, suspect = refine(task, model, solve_block(task, model))
     count, corner = math.prod(task.shape), task.corner
     leading = upper_half(samples.multipliers[:, 0])
     names = task.grid.x.moved, task.grid.y.moved
     crossed, apart = _crossed(samples), _apart(samples, model, names)
-    sides = _sides(done, 2**task.settings.depth, lambda i, j: crossed(i, j) | apart(i, j))
-    suspect = done.suspect.copy()
+    sides = _sides(samples, leaves, 2**task.settings.depth, lambda i, j: crossed(i, j) | apart(i, j))
     suspect[:, :2] += corner
     return {
         "leading": leading[:count].reshape(task.shape),
@@ -677,11 +668,11 @@ def _discontinuities(task: TileTask, samples: Samples, sides: Array) -> dict[str
     }
 
 
-def _sides(done: Refined, unit: int, wanted: Between) -> Array:
+def _sides(samples: Samples, leaves: Sequence[Cells], unit: int, wanted: Between) -> Array:
     """Return the `wanted` sides of leaf cells, (E, 3) in order: the samples at their two ends, and the axis they lie along."""
-    points = _Points(done.samples, unit)
+    points = _Points(samples, unit)
     sides: dict[tuple[int, int], int] = {}
-    for cells in done.leaves:
+    for cells in leaves:
         corners = points.index(cells.corners())
         for a, b, axis in SIDES:
             i, j = corners[:, a], corners[:, b]
