@@ -326,10 +326,9 @@ def _cost(lost: LackOfFit, z: Array) -> float:
 def _sufficient_duration(losses: Sequence[LackOfFit], trial: PredictedRun) -> tuple[float | None, int | None]:
     """Return how many seconds of a run gain enough, and how many repeats of it; None where none do."""
     n = trial.run.t.size
-    if min(x.gain() for x in losses) >= DISCRIMINATING_GAIN:
-        for k in np.unique(np.linspace(0, n, DURATION_TRIALS + 1).astype(int)[1:]).tolist():
-            if min(x.gain(samples=k) for x in losses) >= DISCRIMINATING_GAIN:
-                return float(trial.run.t[k - 1] - trial.run.t[0]), 1
+    for k in np.unique(np.linspace(0, n, DURATION_TRIALS + 1).astype(int)[1:]).tolist():
+        if min(x.gain(samples=k) for x in losses) >= DISCRIMINATING_GAIN:
+            return float(trial.run.t[k - 1] - trial.run.t[0]), 1
     several = range(2, MAX_REPEATS + 1)
     repeats = 2 + bisect_left(several, True, key=lambda n: min(x.gain(times=n) for x in losses) >= DISCRIMINATING_GAIN)
     return (repeats * trial.proposal.duration, repeats) if repeats in several else (None, None)

@@ -23,7 +23,7 @@ from srfcli.core.parallel import run_here
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
 from srfcli.numerics.boundary import periodic_map, upper_half
-from srfcli.numerics.collocation import STAGES, Discretisation, join, kernel, mesh_error
+from srfcli.numerics.collocation import STAGES, Discretisation, gauss, join, kernel, mesh_error
 from srfcli.numerics.orbit import (
     CHUNK,
     OrbitBatch,
@@ -387,9 +387,7 @@ class _Block:
 def integrate_to_periodic_state(model: GeneratedModel, p: Array, start: Array, edges: Array) -> Discretisation | None:
     """Return the last of SETTLING periods of the motion that begins in the state `start` (n,), or None where it stops early."""
     V, W0, eps, f = (float(p[model.index(name)]) for name in ("V", "W0", "eps", "f"))
-    blank = np.zeros((len(edges) - 1, STAGES, len(start)))
-    last = Discretisation(blank[:, 0], blank, edges)
-    tau = np.concatenate([edges[:-1, None], last.phases], axis=1)
+    tau = edges[:-1, None] + np.diff(edges)[:, None] * np.append(0.0, gauss().nodes)
     t = np.concatenate([[0.0], (SETTLING + tau.reshape(-1)) / f])
     trace = simulate(model, p, drive=Drive.constant(V), load=Modulation(W0, eps, f), t=t, start=start, rtol=1e-6)
     if trace.status is Status.INTERRUPTED:
