@@ -174,19 +174,6 @@ def _check_positive(name: str, value: float) -> None:
         raise SrfError(f"{name} = {value:g} is not a positive number")
 
 
-# A measured load as piecewise polynomials; um, s, N.
-
-UNEVEN_INTERVAL = 1.6  # ratio of an interval to its neighbours' median at which a stretch ends
-WANDER = 10.0  # times the median of the logarithms of these ratios, if that is more: of times that are all uneven
-SHORTEST_STRETCH = 16  # samples of a stretch that carries the spline
-INTERPOLATION_SAMPLES = 4  # samples on each side from which a sample is interpolated
-ROUGH = 0.02  # share of the local range by which a sample may differ from what its neighbours predict
-LEAST_CORNER = 1e-4  # share of the whole range below which nothing is a corner
-MOSTLY = 0.3  # share of rough samples at which a load is coarsely sampled rather than cornered
-SPACINGS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # samples between the knots of a smoothing spline
-SMOOTHING_BLOCK = 32  # samples over which the smoothness may vary
-
-
 class PolynomialLoad(Load):
     """A load that consists of `coefficients` (k, degree + 1), lowest power first in the time since the knot, at `knots` (k + 1,).
 
@@ -210,6 +197,19 @@ class PolynomialLoad(Load):
         rows[0] = _shifted(rows[0], start - knots[0])
         knots[0], knots[-1] = start, end
         return knots, rows
+
+
+# A measured load as piecewise polynomials; um, s, N.
+
+UNEVEN_INTERVAL = 1.6  # ratio of an interval to its neighbours' median at which a stretch ends
+WANDER = 10.0  # times the median of the logarithms of these ratios, if that is more: of times that are all uneven
+SHORTEST_STRETCH = 16  # samples of a stretch that carries the spline
+INTERPOLATION_SAMPLES = 4  # samples on each side from which a sample is interpolated
+ROUGH = 0.02  # share of the local range by which a sample may differ from what its neighbours predict
+LEAST_CORNER = 1e-4  # share of the whole range below which nothing is a corner
+MOSTLY = 0.3  # share of rough samples at which a load is coarsely sampled rather than cornered
+SPACINGS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # samples between the knots of a smoothing spline
+SMOOTHING_BLOCK = 32  # samples over which the smoothness may vary
 
 
 class SampledLoad(PolynomialLoad):
