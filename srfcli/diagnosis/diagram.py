@@ -12,7 +12,8 @@ from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.errors import SrfError
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.search import Fitted
-from srfcli.inference.prediction import stiffness_share
+from srfcli.inference.critical_loads import apparatus
+from srfcli.inference.prediction import run_parameters
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.numerics.continuation import ContinuationSettings, find_components
@@ -90,17 +91,14 @@ def _model(registry: Registry, experiment: Experiment, at: Mapping[str, float] |
 
     What acts in some runs alone is as in the others: it is no part of the system.
     """
-    values = {q.name: q.value for q in experiment.parameters} | dict(at or {})
-    values |= {q.name: q.elsewhere for q in experiment.parameters if q.runs}
+    values = dict(at or {}) | {q.name: q.elsewhere for q in experiment.parameters if q.runs}
     model = open_model(registry, **asdict(experiment.choice), stability=True)
-    own = {n: v for n, v in values.items() if n in model.names and n not in ("V", "W0", "K")}
-    share, stated = 1.0, experiment.stiffness
     if experiment.runs:
-        share, stated = stiffness_share(experiment, experiment.runs[0]), experiment.runs[0].stiffness
-    own["K"] = values["K"] * share if "K" in values else stated
-    if "M" in model.names and experiment.mass is not None:
-        own.setdefault("M", experiment.mass)
-    return model, model.vector({**own, "W0": 1.0, "eps": 0.0})
+        p = run_parameters(model, experiment, experiment.runs[0], values)
+    else:
+        given = apparatus(experiment, 1.0) | values
+        p = model.vector({n: v for n, v in given.items() if n in model.names})
+    return model, model.with_values(p, W0=1.0, eps=0.0)
 
 
 def _loads(model: GeneratedModel, base: Array, V: Array) -> Array:
