@@ -227,7 +227,9 @@ def follow(
 def remeshed(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: StepSettings) -> CurvePoint | None:
     """Return `point` on a finer mesh where its own is too coarse, on a coarser one that suffices, None where it may stay."""
     N, error = point.orbit.intervals, float(mesh_error(model, point.orbit))
-    mesh = suited_mesh(error, N, settings)
+    # an error goes as N^-8, and half of the settings' is aimed at; a multiple of 4 intervals
+    ratio = float(np.clip((2 * np.nan_to_num(error, nan=np.inf) / settings.mesh_error) ** 0.125, 0.25, 4.0))
+    mesh = min(max(4 * int(np.ceil(N * ratio / 4)), FEWEST_INTERVALS), max(settings.max_mesh, N))
     if (error <= settings.mesh_error and mesh > COARSER * N) or mesh == N:
         return None
     start, across = _on_mesh(point, uniform_mesh(mesh)), (point.tangent_q, _along_orbit(model, point))
@@ -237,12 +239,6 @@ def remeshed(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: S
 def _on_mesh(point: CurvePoint, edges: Array) -> CurvePoint:
     """Return `point` interpolated on another mesh, uncorrected."""
     return replace(point, orbit=interpolate(point.orbit, edges), tangent_orbit=interpolate(point.tangent_orbit, edges))
-
-
-def suited_mesh(error: float, intervals: int, settings: StepSettings) -> int:
-    """Return the intervals, a multiple of 4, that leave half the settings' error where `intervals` leave `error`, as N^-8."""
-    ratio = float(np.clip((2 * np.nan_to_num(error, nan=np.inf) / settings.mesh_error) ** 0.125, 0.25, 4.0))
-    return min(max(4 * int(np.ceil(intervals * ratio / 4)), FEWEST_INTERVALS), max(settings.max_mesh, intervals))
 
 
 def arclength(model: GeneratedModel, a: CurvePoint, b: CurvePoint, turned: float) -> float:
