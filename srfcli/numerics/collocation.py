@@ -228,10 +228,6 @@ class Discretisation:
         each = np.asarray(factor)[..., None, None]
         return Discretisation(each * self.x, each[..., None] * self.stages, self.edges)
 
-    def __truediv__(self, divisor: Array | float) -> Discretisation:
-        each = np.asarray(divisor)[..., None, None]
-        return Discretisation(self.x / each, self.stages / each[..., None], self.edges)
-
 
 def join(parts: Sequence[Discretisation]) -> Discretisation:
     """Return batches of orbits on one mesh as one batch."""

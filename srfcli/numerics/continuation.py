@@ -157,7 +157,7 @@ def _normalised(model: GeneratedModel, point: CurvePoint, orientation: CurvePoin
         before = orientation.tangent_orbit.x[0] / size * ORBIT_WEIGHT
         if point.tangent_q @ orientation.tangent_q + along_x @ before < 0:
             length = -length
-    return replace(point, tangent_q=point.tangent_q / length, tangent_orbit=point.tangent_orbit / length)
+    return replace(point, tangent_q=point.tangent_q / length, tangent_orbit=(1 / length) * point.tangent_orbit)
 
 
 def predict(a: CurvePoint, b: CurvePoint | None, ds: float) -> tuple[Array, Discretisation]:

@@ -190,7 +190,7 @@ def climbed(model: GeneratedModel, p: Array, finest: int) -> tuple[OrbitBatch, f
         again = solve_orbits(model, q, moved, tol=ROUNDED, max_iterations=CLIMBING)
         if again.converged[0]:
             found, before = again, interpolate(before, again.orbit.edges)
-        slope = (found.orbit - before) / ahead
+        slope = (1 / ahead) * (found.orbit - before)
         batch, reached, step = found, target, 1.5 * step
     batch.converged &= reached >= 1
     batch.p[:] = p

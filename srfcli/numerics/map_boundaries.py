@@ -348,7 +348,7 @@ def continued_end(model: GeneratedModel, plane: Plane, discontinuity: Discontinu
         if not found.converged[0] or off > SAME_STATE or not abs(leading) < 1:
             step /= 2
             continue
-        slope = (found.orbit.part(0) - orbit - shift) / reach
+        slope = (1 / reach) * (found.orbit.part(0) - orbit - shift)
         share, rho, p, step = ahead, leading, q, 2 * step if off < SAME_STATE / 4 else step
         orbit = found.orbit.part(0)
         if share == 1.0:

@@ -271,7 +271,7 @@ def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7)
         before = batch.orbit.part(at)
         found = solve_orbits(model, q, before + step[at] * slope.part(at), tol=tol, max_iterations=CLIMBING)
         new, got, lost = np.nonzero(found.converged)[0], at[found.converged], at[~found.converged]
-        change = (found.orbit.part(new) - before.part(new)) / step[got]
+        change = (1 / step[got]) * (found.orbit.part(new) - before.part(new))
         slope.x[got], slope.stages[got] = change.x, change.stages
         batch.replace(got, found.part(new))
         reached[got] += step[got]
