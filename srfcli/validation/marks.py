@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from srfcli.core.errors import SrfError
 from srfcli.core.files import read_text, write_atomic
@@ -655,7 +656,6 @@ def row_of(m: GradedAnswer) -> Mapping[str, Any]:
 
 # Counts as rates with intervals, and stated confidence against how often it was right.
 
-WILSON_Z = 1.959963984540054  # of a two-sided interval of 95 %
 EDGES = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)
 
 
@@ -676,11 +676,8 @@ class Rate:
         """Return the bounds of the interval (Wilson 1927): it holds near 0 and 1 too, where the usual one is empty."""
         if not self.count:
             return None, None
-        n, p = self.count, self.hits / self.count
-        middle = (p + WILSON_Z**2 / (2 * n)) / (1 + WILSON_Z**2 / n)
-        half = WILSON_Z / (1 + WILSON_Z**2 / n) * (p * (1 - p) / n + WILSON_Z**2 / (4 * n**2)) ** 0.5
-        # the exact ends: rounding must not put 0 of n above 0
-        return (0.0 if self.hits == 0 else middle - half), (1.0 if self.hits == n else middle + half)
+        found = binomtest(self.hits, self.count).proportion_ci(method="wilson")
+        return float(found.low), float(found.high)
 
 
 def rate(flags: Iterable[bool]) -> Rate:
