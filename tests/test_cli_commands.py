@@ -238,7 +238,7 @@ BAD: list[tuple[Sequence[str], str]] = [
     (["linear", "--over", "V=1:2:3:4:5"], "5 fields"),
     (["continue", "--over", "V=1,2"], "lists values"),
     (["continue", "--over", "W0=1:20"], "spans no plane"),
-    (["continue", "--over", "V=1:2", "--over", "W0=1:2", "--over", "K=1:2"], "is given 3 times"),
+    (["continue", "--over", "V=1:2", "--over", "W0=1:2", "--over", "K=1:2"], "--over has 3 axes"),
     (["continue", "--over", "V=1:2", "--over", "V=1:2"], "given twice"),
     (["continue", "--over", "eps=0.1:0.2", "--eps", "0.1"], "eps is an axis"),
     (["continue", "--over", "V=1:2", "--V", "7"], "V is an axis"),

@@ -176,7 +176,7 @@ def test_every_axis_of_a_narrow_response_has_ticks_in_plain_numbers():
         (("--mean",), "--mean needs amplitudes"),
         (("--eps", "0.1"), "no part in the linear response"),
         (("--over", "V=1:10", "--V", "3"), "V is an axis and has a value"),
-        (("--over", "V=1:10", "--over", "f=1:10"), "given 2 times"),
+        (("--over", "V=1:10", "--over", "f=1:10"), "--over has 2 parameters"),
         (("--over", "eps=0,0.1"), "eps is not swept"),
         (("--over", "eps=0,0.1", "--mean", "--eps", "0.1"), "eps is not swept"),
     ],

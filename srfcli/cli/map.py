@@ -249,8 +249,6 @@ def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], taken: dict[str, A
     chosen = [[Setting(name, "flag") for name in laws] or [system.chosen["law"]]]
     chosen.append([Setting(name, "flag") for name in ageings] or [system.chosen["ageing"]])
     pairs = {(law.value, ageing.value): {"law": law, "ageing": ageing} for law, ageing in itertools.product(*chosen)}
-    if len(pairs) < 2:
-        raise SrfError("one law is nothing to compare", "Name more: --law srf-vsat --law log-log, or several --ageing.")
     openers = [replace(system, chosen={**system.chosen, **pair}).opener() for pair in pairs.values()]
     known = {n for opener in openers for n in opener.model.names}
     for name in system.flags:

@@ -31,7 +31,10 @@ OWN_RECORD = {  # options that describe a new record; they exclude EXPERIMENT, w
     "V": "--V", "W0": "--W0", "eps": "--eps", "drive": "--drive", "load": "--load", "load_file": "--load-file",
     "onset": "--onset", "duration": "--for", "rate": "--rate", "observable": "--observe", "free": "--free",
 }  # fmt: skip
-NOT_TOLD = ("V", "W0", "eps", "runs")  # options that are parameters of the slider, or of an experiment
+PROGRAM = (
+    *(name for name in OWN_RECORD if name not in ("V", "W0", "eps")),
+    "load_rise",
+)  # options that are no parameter of the slider
 EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load_file"), ("load", "load_file"))
 
 
@@ -103,25 +106,24 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
 
     _check(given, experiment, output)
     warn_uncompiled("a simulation takes up to 34 times as long")
+    how = task.Recorder(**{f.name: given[f.name] for f in dataclasses.fields(task.Recorder)})
     if experiment is None:
         slider = system.slider(True, **{name: given[name] for name in ("V", "W0", "eps")})
-        work = task.record_as_told(slider, **{name: value for name, value in given.items() if name not in NOT_TOLD})
+        work = task.record_as_told(slider, how, **{name: given[name] for name in PROGRAM})
         told = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
         system.say_defaults(slider.resolved, [name for name, text in told.items() if text is None])
     else:  # srf.toml and the environment do not choose the laws of an experiment, flags do
         laws = {name: setting.value for name, setting in system.chosen.items() if setting.origin == "flag"}
-        rest = {name: value for name, value in given.items() if name not in {*OWN_RECORD, "load_rise"}}
-        chosen: dict[str, Any] = {"laws": laws, "effects": system.effects, "parameters": system.flags}
-        work = task.runs_again(experiment, system.registry(), **chosen, **rest)
+        chosen = {"laws": laws, "effects": system.effects, "parameters": system.flags, "runs": given["runs"]}
+        work = task.runs_again(experiment, system.registry(), how, **chosen)
     with Progress("simulate", total=len(work.jobs)) as progress:
-        found = task.simulate_work(work, rtol=given["rtol"], progress=lambda name, done: progress.advance(int(done), note=name))
+        found = task.simulate_work(work, rtol=how.rtol, progress=lambda name, done: progress.advance(int(done), note=name))
     timings, table = {"simulate": progress.seconds}, found.table
-    folder, seed = given["folder"], given["seed"]
-    if folder is not None and output.out is None and output.format == "text":
+    if how.folder is not None and output.out is None and output.format == "text":
         table = dataclasses.replace(table, columns=(), rows=())  # the records are in the folder
-    emit(table, output, figure=found.plot, laws=work.model.laws, inputs=work.inputs, seed=seed, timings=timings)
-    if folder is not None:
-        _write(found, folder, seed, output, timings)
+    emit(table, output, figure=found.plot, laws=work.model.laws, inputs=work.inputs, seed=how.seed, timings=timings)
+    if how.folder is not None:
+        _write(found, how.folder, how.seed, output, timings)
     finish(found.status)
 
 

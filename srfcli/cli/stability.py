@@ -131,21 +131,17 @@ def response(
     """
     from srfcli.tasks import stability
 
-    if len(over) != 1:
-        raise SrfError(f"--over is given {len(over)} times", "One parameter is swept: --over f=1:1000:200.")
     if mean and not eps:
         raise SrfError("--mean needs amplitudes", "Give some: --mean --eps 0.05,0.1,0.2.")
     if eps and not mean:
         raise SrfError("--eps has no part in the linear response", "Leave it out, or ask for --mean.")
-    if over[0].name == "eps":
-        raise SrfError("eps is not swept", "Give amplitudes: --mean --eps 0.05,0.1,0.2; the linear response has none.")
     slider = system.slider(V=V, W0=W0)
-    swept = over[0].fitted(slider.model.parameters, where=slider.model.title)
-    options.check_axes({swept.name}, {"V": V, "W0": W0})
-    system.say_defaults(slider.resolved, {"V", "W0"} - {swept.name})
+    swept = {r.name: r.fitted(slider.model.parameters, where=slider.model.title).points() for r in over}
+    options.check_axes(swept, {"V": V, "W0": W0})
+    system.say_defaults(slider.resolved, {"V", "W0"} - swept.keys())
     tolerance = system.tolerance(tol).value
     with Progress("response") as progress:
-        found = stability.response(slider, over={swept.name: swept.points()}, eps=eps or None, tol=tolerance)
+        found = stability.response(slider, over=swept, eps=eps or None, tol=tolerance)
     emit(found.table, output, laws=slider.model.laws, timings={"solve": progress.seconds}, figure=found.plot)
     finish(found.status)
 
@@ -254,8 +250,6 @@ def continue_(
     model = slider.model
     steps = StepSettings(largest=step, max_steps=max_steps)
     settings = ContinuationSettings(tol=system.tolerance(tol).value, steps=steps, **search)
-    if len(over) > 2:
-        raise SrfError(f"--over is given {len(over)} times", "A plane has two axes: --over V=1:100 --over W0=4:400.")
     for given in over:
         given.check_ends()
     ranges = [r.fitted(model.parameters, where=model.title) for r in over or (options.parse_over("V=1:100"),)]

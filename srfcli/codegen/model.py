@@ -118,9 +118,13 @@ class GeneratedModel:
             except ArithmeticError:
                 return np.zeros(p.shape[1:], dtype=bool)
 
+    def unit(self, name: str) -> str:
+        """Return the unit that a parameter is declared in."""
+        return self.parameters[self.index(name)].unit
+
     def declared(self, name: str, value: float) -> float:
         """Return a value in um, s, N in the unit the parameter is declared in."""
-        return from_base(value, self.parameters[self.index(name)].unit)
+        return from_base(value, self.unit(name))
 
 
 def open_model(

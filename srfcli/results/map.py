@@ -261,13 +261,13 @@ class MapResult(Result):
 
 def ratio_powers(model: GeneratedModel, held: str, moved: str) -> tuple[int, ...]:
     """Return the powers of (um, s, N, rad) of the ratio of two parameters."""
-    top, bottom = (find_unit(model.parameters[model.index(n)].unit).powers for n in (held, moved))
+    top, bottom = (find_unit(model.unit(n)).powers for n in (held, moved))
     return tuple(a - b for a, b in zip(top, bottom, strict=True))
 
 
 def axis_unit(model: GeneratedModel, axis: MapAxis) -> str:
     """Return the unit in which an axis is shown: the parameter's declared one, um, s, N for a ratio."""
-    return describe(ratio_powers(model, axis.held, axis.moved)) if axis.held else model.parameters[model.index(axis.moved)].unit
+    return describe(ratio_powers(model, axis.held, axis.moved)) if axis.held else model.unit(axis.moved)
 
 
 def shown(model: GeneratedModel, axis: MapAxis, value: float) -> float:
@@ -494,8 +494,7 @@ class ComparisonResult(Result):
         first, K = studies[min(studies)].crossings[0][:, 0], float(self.matches[0].p[models[0].index("K")])
         labels = []
         for k, (name, model) in enumerate(zip(self.names, models, strict=True)):
-            units = {q.name: q.unit for q in model.parameters}
-            told = ", ".join(plots.valued(n, value, units[n]) for n, value in self._adjusted(k).items())
+            told = ", ".join(plots.valued(n, value, model.unit(n)) for n, value in self._adjusted(k).items())
             labels.append(f"{plots.name_text(name)}, matched with {told}" if told else plots.name_text(name))
         branches = [
             {"eps": k, "label": labels[k], "V": curve[:, 0].tolist(), "K_over_W0": (K / curve[:, 1]).tolist()}

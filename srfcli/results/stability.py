@@ -220,19 +220,18 @@ class LinearResult(Result):
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the critical K/W0 (1/um) over the first parameter that was swept, a curve for each value of the others."""
         (x, values), *others = self.over.items()
-        unit = {q.name: q.unit for q in self.system.model.parameters}
         if x == "V" and not others:
             curve = {k: [row.get(k) for row in self.points] for k in ("V", "K_over_W0")}
             return plots.stability_diagram([], hopf=curve, title=self._figure_title, ax=ax)
         groups: dict[str, list[Mapping[str, Any]]] = {}
         for row in self.points:
-            name = ", ".join(plots.valued(n, row[n], unit[n]) for n, _ in others)
+            name = ", ".join(plots.valued(n, row[n], self.system.model.unit(n)) for n, _ in others)
             groups.setdefault(name, []).append(row)
         return plots.lines(
             [row[x] for row in next(iter(groups.values()))],
             [[row.get("K_over_W0") for row in group] for group in groups.values()],
             list(groups),
-            plots.axis_label(x, unit[x]),
+            plots.axis_label(x, self.system.model.unit(x)),
             "critical K/W$_0$  [1/µm]",
             logx=spread(values),
             title=self._figure_title,
@@ -373,7 +372,7 @@ class MeanFrictionResult(Result):
 
 def _swept(system: SlidingSystem, name: str) -> Column:
     """Return the column of the parameter that was swept."""
-    return Column(name, system.model.parameters[system.model.index(name)].unit, "", ".8g")
+    return Column(name, system.model.unit(name), "", ".8g")
 
 
 # One forced periodic state: its Floquet multipliers, mean friction and harmonics.
@@ -628,12 +627,11 @@ class BoundaryResult(Result):
             for branch in boundary.branches
         ]
         if not usual:
-            unit = {q.name: q.unit for q in model.parameters}
             with plots.one_panel(ax, title=title) as (figure, ax):
                 ax.set_xscale("log" if plane.x.log else "linear")
                 ax.set_yscale("log" if plane.y.log else "linear")
                 plots.draw_branches(ax, branches)
-                xlabel, ylabel = (plots.axis_label(a, unit[a]) for a in self._axes)
+                xlabel, ylabel = (plots.axis_label(a, model.unit(a)) for a in self._axes)
                 ax.set(xlabel=xlabel, ylabel=ylabel)
                 plots.decade_ticks(ax)
                 return figure

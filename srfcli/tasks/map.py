@@ -124,8 +124,8 @@ def _axis(model: GeneratedModel, given: tuple[str, float, float, int] | MapAxis,
         require_parameter(part, model.parameters, where=model.title)
     if held:
         return MapAxis(moved, float(lo), float(hi), count, log, held)
-    unit = model.parameters[model.index(moved)].unit
-    return MapAxis(moved, to_base(float(lo), unit), to_base(float(hi), unit), count, log)
+    lo, hi = (to_base(float(end), model.unit(moved)) for end in (lo, hi))
+    return MapAxis(moved, lo, hi, count, log)
 
 
 def _boundaries(

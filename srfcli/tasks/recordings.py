@@ -35,6 +35,7 @@ from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import Registry, load_registry
 from srfcli.results.check import CheckResult, DraftResult
 from srfcli.results.fit import PAIRS, CampaignResult, FitResult, ThresholdFitResult
+from srfcli.results.tables import plain_value
 
 if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
@@ -693,11 +694,11 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     table = {row[0]: row for row in found.table.rows}
     listed = {q.name for q in experiment.parameters}
     own = [name for name in result.names if name in listed]
-    parameters = {name: (table[name][1], _number(table[name][2]), table[name][5]) for name in own}
+    parameters = {name: (table[name][1], plain_value(table[name][2]), table[name][5]) for name in own}
     values = found.values_with_means
     for name, mean, error, _, unit, _ in found.varied.rows if found.varied else ():  # without an error where one is at its bound
         shown = from_base(values[name], unit) if mean is None else mean
-        parameters[name] = (shown, _number(error), unit)
+        parameters[name] = (shown, plain_value(error), unit)
     place = {name: k for k, name in enumerate(result.names)}
     covariance = np.asarray(result.covariance)
     unit, factor = experiment.shown("1/um" if experiment.per_load else "N/um")
@@ -706,14 +707,14 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
         if not {a, b} <= place.keys() or math.inf in (result.stderr[a], result.stderr[b]):
             return None
         scale = math.prod([factor if name == "K" else from_base(1.0, problem.unit_of(name)) for name in (a, b)])
-        return _number(float(covariance[place[a], place[b]]) * scale)
+        return plain_value(float(covariance[place[a], place[b]]) * scale)
 
     row: dict[str, Any] = {
         "experiment": path, "status": found.worst.value, "law": f"{experiment.choice.law}, {experiment.choice.ageing}",
         "runs": len(runs), "samples": sum(int(run.used.sum()) for run in runs),
         "load": float(np.mean([run.load(run.t)[0].mean() for run in runs])) if all(run.load_known for run in runs) else None,
         "load_unit": runs[0].load_unit if runs[0].load_known else None,
-        "parameters": parameters, "rms_over_noise": _number(result.rms_over_noise()),
+        "parameters": parameters, "rms_over_noise": plain_value(result.rms_over_noise()),
         "covariances": {name: shared(*pair) for name, pair in PAIRS.items()},
     }  # fmt: skip
     row["V0"] = next((q.value for q in experiment.parameters if q.name == "V0"), None)
@@ -738,10 +739,6 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     }
     row["flags"] = "; ".join(_flags(row, found))
     return row
-
-
-def _number(value: float | None) -> float | None:
-    return float(value) if value is not None and np.isfinite(value) else None
 
 
 def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:

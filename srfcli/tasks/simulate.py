@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
@@ -147,30 +147,6 @@ def check_observables(names: Sequence[str]) -> list[str]:
     if not 1 <= len(names) <= MOST_OBSERVABLES:
         raise SrfError(f"{len(names)} observables", f"Name one to {MOST_OBSERVABLES}.")
     return list(names)
-
-
-def read_gauges(
-    observables: Sequence[str], *, noise: str | None, lag1: float, quantum: str | None, seed: int
-) -> dict[str, Gauge]:
-    """Return the gauge of each observable; sizes are text as '0.01,0.2', in the observables' units unless one is written.
-
-    Raises SrfError for what no gauge does.
-    """
-    sizes = []
-    for name, text in (("noise", noise), ("quantum", quantum)):
-        texts = ["0"] * len(observables) if text is None else text.split(",")
-        if len(texts) != len(observables):
-            raise SrfError(
-                f"`{name}` {text}: found {len(texts)}, expected one for each of {', '.join(observables)}",
-                f"Write `{name}` {','.join(['0.01'] * len(observables))}.",
-            )
-        units = [(OBSERVABLES | OTHER_OBSERVABLES)[observable] for observable in observables]
-        sizes.append([parse_quantity(text, unit, name=f"`{name}`") for text, unit in zip(texts, units, strict=True)])
-    silent = any(sizes[0])  # a gauge without noise beside others; of none, a colour is told
-    gauges = [Gauge(n, lag1 if n or not silent else 0.0, q, seed) for n, q in zip(*sizes, strict=True)]
-    for gauge in gauges:
-        check_gauge(**asdict(gauge))
-    return dict(zip(observables, gauges, strict=True))
 
 
 # A new record: one slider under a drive and a load.
@@ -353,46 +329,104 @@ FIELD_LENGTH = 10.0  # um, the correlation length where only a size is given
 Piece = tuple[float, float, float]  # duration (s), and the values between which a quantity runs straight
 
 
+@dataclass(frozen=True, kw_only=True)
+class Recorder:
+    """How records are begun, read and written, as the options of `srf simulate` tell it; its methods raise SrfError.
+
+    `noise`, `lag1` and `quantum` are those of the gauges, `field` and `field_length` those of the track. With `folder` the
+    records are written as an experiment, which has `start_values`.
+    """
+
+    reader: str | None
+    start: str
+    noise: str | None
+    lag1: float
+    quantum: str | None
+    field: str | None
+    field_length: str | None
+    seed: int
+    folder: Path | None
+    start_values: str
+    rtol: float
+
+    def gauges(self, observables: Sequence[str]) -> dict[str, Gauge]:
+        """Return the gauge of each observable; sizes are as '0.01,0.2', in the observables' units unless one is written."""
+        sizes = []
+        for name, text in (("noise", self.noise), ("quantum", self.quantum)):
+            texts = ["0"] * len(observables) if text is None else text.split(",")
+            if len(texts) != len(observables):
+                raise SrfError(
+                    f"`{name}` {text}: found {len(texts)}, expected one for each of {', '.join(observables)}",
+                    f"Write `{name}` {','.join(['0.01'] * len(observables))}.",
+                )
+            units = [(OBSERVABLES | OTHER_OBSERVABLES)[observable] for observable in observables]
+            sizes.append([parse_quantity(text, unit, name=f"`{name}`") for text, unit in zip(texts, units, strict=True)])
+        silent = any(sizes[0])  # a gauge without noise beside others; of none, a colour is told
+        gauges = [Gauge(n, self.lag1 if n or not silent else 0.0, q, self.seed) for n, q in zip(*sizes, strict=True)]
+        for gauge in gauges:
+            check_gauge(**asdict(gauge))
+        return dict(zip(observables, gauges, strict=True))
+
+    def spread(self) -> float:
+        """Return by how much, relatively, written start values may be off: 0 for 'true', 0.1 for 'perturb:10%'."""
+        text = self.start_values
+        if text == "true":
+            return 0.0
+        kind, colon, size = text.partition(":")
+        if kind != "perturb" or not colon:
+            raise SrfError(f"`start_values` {text!r} is neither true nor perturb:SIZE", "Write `start_values` perturb:10%.")
+        share = size.strip().removesuffix("%")
+        spread = parse_quantity(share, "1", name="`start_values` perturb") / (100.0 if share != size.strip() else 1.0)
+        if not 0 <= spread < 1:
+            raise SrfError(f"`start_values` {text}: the size is not between 0 and 100 %", "Write perturb:10%.")
+        return spread
+
+    def track(self) -> tuple[FrictionField, dict[str, dict[str, Any]]] | None:
+        """Return the random field, and its size and length as {value, unit, origin}; None without one."""
+        if self.field is None:
+            if self.field_length is not None:
+                raise SrfError("`field_length` is given without a field", "Give the size: `field` 3e-4.")
+            return None
+        amplitude = parse_quantity(self.field, "1", name="`field`")
+        length = parse_quantity(self.field_length or str(FIELD_LENGTH), "um", name="`field_length`")
+        field = FrictionField(amplitude, length, self.seed)
+        described = {
+            "field_amplitude": {"value": amplitude, "unit": "1", "origin": "flag"},
+            "field_length": {"value": length, "unit": "um", "origin": "default" if self.field_length is None else "flag"},
+        }
+        return (field, described) if amplitude else None
+
+
 def record_as_told(
     system: SlidingSystem,
+    how: Recorder,
     *,
-    drive: str | None = None,
-    load: str | None = None,
-    load_rise: str = f"{STEP_RISE:g} s",
-    load_file: Path | None = None,
-    reader: str | None = None,
-    duration: str | None = None,
-    rate: str | None = None,
-    onset: str | None = None,
-    start: str = "steady",
-    observable: str | None = None,
-    noise: str | None = None,
-    lag1: float = 0.0,
-    quantum: str | None = None,
-    field: str | None = None,
-    field_length: str | None = None,
-    seed: int = 0,
-    folder: Path | None = None,
-    free: str | None = None,
-    start_values: str = "true",
-    rtol: float = 1e-8,
+    drive: str | None,
+    load: str | None,
+    load_rise: str,
+    load_file: Path | None,
+    duration: str | None,
+    rate: str | None,
+    onset: str | None,
+    observable: str | None,
+    free: str | None,
 ) -> Work:
     """Return one record of a slider, to be simulated, as the options of `srf simulate` tell it.
 
-    Raises SrfError for what cannot be simulated, or written to `folder` as an experiment.
+    Raises SrfError for what cannot be simulated, or written as an experiment.
     """
     values, opener = system.resolved.values, system.opener
-    spread, track = read_spread(start_values), read_field(field, field_length, seed)
+    spread, track = how.spread(), how.track()
     observables = check_observables([name.strip() for name in (observable or "elongation").split(",")])
     if opener.names["loading"] != "vertical":
         if track is not None:
             raise SrfError("a friction field is for a slider loaded from above", "Leave out `field` or `loading` inclined.")
-        if folder is not None:
+        if how.folder is not None:
             raise SrfError("an experiment folder cannot say that the spring is inclined", "Leave out `folder` or `loading`.")
     imposed: Load = ConstantLoad(values["W0"])
     begin, length, notes = 0.0, None, list[str]()
     if load_file is not None:
-        imposed, times, notices = read_load(load_file, registry=opener.registry, format=reader)
+        imposed, times, notices = read_load(load_file, registry=opener.registry, format=how.reader)
         begin, length, notes = float(times[0]), float(times[-1] - times[0]), list(map(str, notices))
     elif load is not None:
         steps = read_pieces(load, "N", name="load", example="2:5, 0.2:5->7, 4:7")
@@ -411,7 +445,7 @@ def record_as_told(
         drive=Drive.sequence(pieces, start=begin),
         load=imposed,
         onset=None if onset is None else parse_quantity(onset, "s", name="`onset`"),
-        start=start,
+        start=how.start,
         observables=observables,
         on=on,
     )
@@ -419,16 +453,17 @@ def record_as_told(
     for name, text, unit in (("V", drive, "s:um/s"), ("W0", load or load_file, "s:N")):
         if text is not None:
             described[name] = {"value": str(text), "unit": unit, "origin": "flag"}
+    made = None if how.folder is None else new_experiment(system, choice, how.folder, free=free, spread=spread, seed=how.seed)
     files = [name for name in (choice.law, choice.ageing, choice.interface, *choice.effects) if name.endswith(LAW_FILES)]
     return replace(
         work,
         parameters=described | (track[1] if track else {}),
-        gauges=read_gauges(observables, noise=noise, lag1=lag1, quantum=quantum, seed=seed),
-        experiment=None if folder is None else new_experiment(system, choice, folder, free=free, spread=spread, seed=seed),
+        gauges=how.gauges(observables),
+        experiment=made,
         remarks=tuple(f"the experiment names the file {name}" for name in files),
         inputs=() if load_file is None else (load_file,),
         notes=(*notes, *work.notes, *_sampling_notes(rates, f, None if load is None else length, whole)),
-        meta={"rate_Hz": sorted(set(rates)), "rtol": rtol, "onset": modulation and modulation[2], **work.meta},
+        meta={"rate_Hz": sorted(set(rates)), "rtol": how.rtol, "onset": modulation and modulation[2], **work.meta},
     )
 
 
@@ -508,35 +543,6 @@ def read_rates(text: str, pieces: int) -> tuple[float, ...]:
     return rates * pieces if len(rates) == 1 else rates
 
 
-def read_spread(text: str) -> float:
-    """Return by how much, relatively, written start values may be off: 0 for 'true', 0.1 for 'perturb:10%'."""
-    if text == "true":
-        return 0.0
-    kind, colon, size = text.partition(":")
-    if kind != "perturb" or not colon:
-        raise SrfError(f"`start_values` {text!r} is neither true nor perturb:SIZE", "Write `start_values` perturb:10%.")
-    share = size.strip().removesuffix("%")
-    spread = parse_quantity(share, "1", name="`start_values` perturb") / (100.0 if share != size.strip() else 1.0)
-    if not 0 <= spread < 1:
-        raise SrfError(f"`start_values` {text}: the size is not between 0 and 100 %", "Write perturb:10%.")
-    return spread
-
-
-def read_field(size: str | None, length: str | None, seed: int) -> tuple[FrictionField, dict[str, dict[str, Any]]] | None:
-    """Return the random field of a size and a length, and both as {value, unit, origin}; None without one."""
-    if size is None:
-        if length is not None:
-            raise SrfError("`field_length` is given without a field", "Give the size: `field` 3e-4.")
-        return None
-    amplitude = parse_quantity(size, "1", name="`field`")
-    field = FrictionField(amplitude, parse_quantity(length or str(FIELD_LENGTH), "um", name="`field_length`"), seed)
-    described = {
-        "field_amplitude": {"value": field.amplitude, "unit": "1", "origin": "flag"},
-        "field_length": {"value": field.length, "unit": "um", "origin": "default" if length is None else "flag"},
-    }
-    return (field, described) if field.amplitude else None
-
-
 # How a new record is sampled, where no times are given.
 
 MOST_SAMPLES = 10_000_000
@@ -596,30 +602,20 @@ OF_THE_APPARATUS = ("K", "M")
 def runs_again(
     source: Path,
     registry: Registry,
+    how: Recorder,
     *,
     laws: Mapping[str, Any],
-    effects: Sequence[str] = (),
+    effects: Sequence[str],
     parameters: Mapping[str, str],
-    runs: Sequence[str] = (),
-    reader: str | None = None,
-    start: str = "steady",
-    noise: str | None = None,
-    lag1: float = 0.0,
-    quantum: str | None = None,
-    field: str | None = None,
-    field_length: str | None = None,
-    seed: int = 0,
-    folder: Path | None = None,
-    start_values: str = "true",
-    rtol: float = 1e-8,
+    runs: Sequence[str],
 ) -> Work:
     """Return the runs of the experiment at `source`, to be simulated with its own laws and values but for those given.
 
     `laws` are fields of its ModelChoice, `effects` are added to its own, `parameters` are values as text; `runs` are names of
-    runs, all if left out. What else is given is as in `record_as_told`.
+    runs, all where there are none.
     """
-    spread, track = read_spread(start_values), read_field(field, field_length, seed)
-    experiment = read_experiment(source, registry=registry, format=reader)
+    spread, track = how.spread(), how.track()
+    experiment = read_experiment(source, registry=registry, format=how.reader)
     if laws.get("loading", "vertical") != "vertical":
         raise SrfError("the runs of an experiment are loaded from above", "Leave out `loading` inclined.")
     experiment.check_recorded("to simulate")
@@ -630,26 +626,25 @@ def runs_again(
     values = _values(model, parameters, stress=experiment.stress)
     chosen = experiment.named(runs)
     observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in chosen))
-    if len(observables) > 1 and (noise or quantum):
+    if len(observables) > 1 and (how.noise or how.quantum):
         raise SrfError(
             f"the runs record {' and '.join(map(', '.join, sorted(observables)))}: one `noise` has no unit for all",
             "Choose runs that record the same, with `runs`.",
         )
-    gauges = read_gauges(observables[0], noise=noise, lag1=lag1, quantum=quantum, seed=seed)
-    jobs = tuple(_job(model, experiment, run, values, start) for run in chosen)
+    jobs = tuple(_job(model, experiment, run, values, how.start) for run in chosen)
     unknown = [run.name for run in chosen if run.initial == "free"]
     begun = f"initial state of {', '.join(unknown)} not known: begun in steady sliding" if unknown else None
     scaled = None if "K" in values else experiment.rescaled()
     notes = tuple(note for note in (begun, scaled) if note)
     inputs = (experiment.path, *(run.file for run in chosen))
-    made = None if folder is None else _experiment_again(experiment, model, choice, values, folder, spread, seed)
+    made = None if how.folder is None else _experiment_again(experiment, model, choice, values, how.folder, spread, how.seed)
     dropped = [p.name for p in experiment.parameters if p.name not in model.names]
     remarks = (f"not written, as {choice.law} has no such parameter: {', '.join(dropped)}",) if dropped else ()
     described = _described(model, experiment, values) | (track[1] if track else {})
-    work = Work(model, jobs, described, gauges, made, remarks, inputs, notes, {"title": experiment.title})
+    work = Work(model, jobs, described, how.gauges(observables[0]), made, remarks, inputs, notes, {"title": experiment.title})
     if track is not None:
-        work = on_field(work, open_model(registry, **asdict(choice), tables=FIELD_TABLE), track[0], start=start)
-    return replace(work, meta={**work.meta, "rtol": rtol})
+        work = on_field(work, open_model(registry, **asdict(choice), tables=FIELD_TABLE), track[0], start=how.start)
+    return replace(work, meta={**work.meta, "rtol": how.rtol})
 
 
 def _values(model: GeneratedModel, parameters: Mapping[str, str], *, stress: bool) -> dict[str, float]:

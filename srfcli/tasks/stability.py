@@ -294,14 +294,13 @@ def response(
 
     over = {"f": FREQUENCIES} if over is None else over
     if len(grid := swept(system.model, over)) != 1:
-        raise SrfError(f"over has {len(grid)} parameters", "One parameter is swept: over={'f': [1, 10, 100]}.")
+        raise SrfError(f"`over` has {len(grid)} parameters", "One is swept, such as f from 1 to 1000 Hz.")
     model, ((name, values),) = system.model, grid.items()
     if name == "eps":
         raise SrfError("eps is not swept", "Give amplitudes by `eps`; the linear response has none.")
     model.check_changing_load(system.vector())
 
-    unit = model.parameters[model.index(name)].unit
-    points = np.array([to_base(value, unit) for value in values])
+    points = np.array([to_base(value, model.unit(name)) for value in values])
 
     def at(amplitude: float) -> Array:
         return model.with_values(system.vector(), **{name: points, "eps": amplitude})
@@ -558,15 +557,15 @@ def _axes(
 ) -> list[Axis]:
     """Return the axes, one or two, x first."""
     if len(over) > 2:
-        raise SrfError(f"{len(over)} axes are given", "A plane has two axes: V and W0.")
+        raise SrfError(f"`over` has {len(over)} axes", "A plane has two: V and W0.")
     axes = []
     for name, ends in over.items():
         values = checked(model, name, ends)
         if len(values) != 2 or not values[0] < values[1]:
             raise SrfError(f"{name} = {ends} is no axis", f'An axis runs from a low to a high end: {{"{name}": (1, 100)}}.')
-        unit = model.parameters[model.index(name)].unit
         log = name in logs if logs is not None else values[1] >= 10 * values[0] > 0
-        axes.append(Axis(name, to_base(values[0], unit), to_base(values[1], unit), log))
+        lo, hi = (to_base(value, model.unit(name)) for value in values)
+        axes.append(Axis(name, lo, hi, log))
     if "eps" in over and amplitudes:
         raise SrfError("eps is an axis and has values too", "Leave out `eps`, or take eps out of `over`.")
     if axes[0].name == "W0":

@@ -44,8 +44,8 @@ class Effect:
     """One concealed piece of physics: `varies`, a field of Physics, departs from `neutral` by `weak` to `strong`.
 
     The sign is drawn from `signs`, and `beside` evenly between bounds; `absent` are the fields of a baseline that has none of it.
-    `listed` says whether a diagnosis may name it, and tell its size as `parameter` in `unit`, `resembles` which names come close
-    where it may not.
+    A diagnosis may name one that is `listed`, and tell its size as `parameter` in `unit`; `resembles` says which names come close
+    to one that it may not.
     """
 
     name: str
@@ -57,10 +57,14 @@ class Effect:
     beside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     absent: Mapping[str, bool | str | float] = field(default_factory=dict)
     scale: float = 1.0  # the field is neutral + scale * sign * size
-    listed: bool = True
     resembles: tuple[str, ...] = ()
     parameter: str = ""
     unit: str = "1"
+
+    @property
+    def listed(self) -> bool:
+        """Return whether a diagnosis may name it."""
+        return self.name not in OUTSIDE_NAMES
 
     def added(self, p: Physics, rng: np.random.Generator, size: float) -> Physics:
         """Return `p` with this effect, its strength `size` of the way from weak to strong, on a logarithmic scale."""
@@ -124,35 +128,31 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("poisson-coupling", "poisson", 0.003, 0.1, BOTH, parameter="shift", unit="um/N"),
 )
 OUTSIDE: tuple[Effect, ...] = (
-    Effect("age-exponent", "p_age", 0.15, 1.0, neutral=1.0, listed=False, resembles=("slip-evolution",)),
+    Effect("age-exponent", "p_age", 0.15, 1.0, neutral=1.0, resembles=("slip-evolution",)),
     Effect(
-        "track-bump", "bump", 8e-4, 8e-3, BOTH, beside={"bump_x": (8.0, 35.0), "bump_w": (0.5, 3.0)}, listed=False,
+        "track-bump", "bump", 8e-4, 8e-3, BOTH, beside={"bump_x": (8.0, 35.0), "bump_w": (0.5, 3.0)},
         resembles=("track-topography",),
     ),
     Effect(
-        "load-memory", "memory", 0.1, 1.0, beside={"memory_tau": (0.001, 0.2)}, listed=False,
+        "load-memory", "memory", 0.1, 1.0, beside={"memory_tau": (0.001, 0.2)},
         resembles=("load-transmission", "linker-dieterich"),
     ),
-    Effect("speed-dependent-length", "D_power", 0.04, 0.4, BOTH, listed=False, resembles=("slip-evolution",)),
+    Effect("speed-dependent-length", "D_power", 0.04, 0.4, BOTH, resembles=("slip-evolution",)),
+    Effect("load-dependent-friction", "W_power", 0.004, 0.08, BOTH, resembles=("adhesion-offset", "tangential-crosstalk")),
+    Effect("age-limit", "age_rate", 0.05, 2.0, resembles=("age-saturation",)),
+    Effect("interface-damping", "eta", 5e-4, 0.02),
+    Effect("drive-lag", "drive_tau", 0.005, 0.15, resembles=("sensor-lag",)),
+    Effect("gauge-backlash", "backlash", 0.015, 0.2, resembles=("sensor-lag",)),
     Effect(
-        "load-dependent-friction", "W_power", 0.004, 0.08, BOTH, listed=False,
-        resembles=("adhesion-offset", "tangential-crosstalk"),
-    ),
-    Effect("age-limit", "age_rate", 0.05, 2.0, listed=False, resembles=("age-saturation",)),
-    Effect("interface-damping", "eta", 5e-4, 0.02, listed=False),
-    Effect("drive-lag", "drive_tau", 0.005, 0.15, listed=False, resembles=("sensor-lag",)),
-    Effect("gauge-backlash", "backlash", 0.015, 0.2, listed=False, resembles=("sensor-lag",)),
-    Effect(
-        "load-servo", "servo", 0.1, 1.0, beside={"servo_f": (2.0, 20.0), "servo_damping": (0.2, 0.9)}, listed=False,
+        "load-servo", "servo", 0.1, 1.0, beside={"servo_f": (2.0, 20.0), "servo_damping": (0.2, 0.9)},
         resembles=("load-transmission", "linker-dieterich"),
     ),
-    Effect("pore-pressure", "pore", 0.02, 0.6, listed=False, resembles=("adhesion-offset",)),
-    Effect("gauge-creep", "creep", 0.003, 0.1, beside={"creep_tau": (0.1, 3.0)}, listed=False, resembles=("sensor-lag",)),
-    Effect("slip-hardening", "harden", 5e-4, 8e-3, BOTH, beside={"harden_x": (5.0, 40.0)}, listed=False,
-           resembles=("friction-drift",)),
-    Effect("frictional-heating", "heat", 5e-6, 2e-4, beside={"heat_tau": (0.05, 2.0)}, listed=False, resembles=("viscous-drag",)),
-    Effect("dilatancy", "dilate", 5e-4, 8e-3, beside={"drain": (0.05, 2.0)}, listed=False, resembles=("second-state",)),
-    Effect("rate-cutoff", "rate_cut", 1 / 2000, 1 / 30, listed=False, resembles=("viscous-drag",)),
+    Effect("pore-pressure", "pore", 0.02, 0.6, resembles=("adhesion-offset",)),
+    Effect("gauge-creep", "creep", 0.003, 0.1, beside={"creep_tau": (0.1, 3.0)}, resembles=("sensor-lag",)),
+    Effect("slip-hardening", "harden", 5e-4, 8e-3, BOTH, beside={"harden_x": (5.0, 40.0)}, resembles=("friction-drift",)),
+    Effect("frictional-heating", "heat", 5e-6, 2e-4, beside={"heat_tau": (0.05, 2.0)}, resembles=("viscous-drag",)),
+    Effect("dilatancy", "dilate", 5e-4, 8e-3, beside={"drain": (0.05, 2.0)}, resembles=("second-state",)),
+    Effect("rate-cutoff", "rate_cut", 1 / 2000, 1 / 30, resembles=("viscous-drag",)),
 )  # fmt: skip
 NAMES = tuple(dict.fromkeys(e.name for e in EFFECTS))
 OUTSIDE_NAMES = tuple(e.name for e in OUTSIDE)
