@@ -86,10 +86,9 @@ def answer(diagnosis: Diagnosis, location: Location, *, discriminating: Discrimi
     if diagnosis.acts_in:
         found["acts_in"] = diagnosis.acts_in
     if loads:
-        chi2 = [dict(zip(sides, v.chi2, strict=True)) for v in loads]
         found["thresholds"] = [
-            {"name": v.loads.name, "holdout": v.loads.holdout, "loads": v.size, "chi2": c}
-            for v, c in zip(loads, chi2, strict=True)
+            {"name": v.loads.name, "holdout": v.loads.holdout, "loads": v.size, "chi2": dict(zip(sides, v.chi2, strict=True))}
+            for v in loads
         ]
     if diagnosis.verdict == "inconclusive":
         found["detectable"] = dict(diagnosis.detectable)
