@@ -33,7 +33,7 @@ from srfcli.inference.state_space import Likelihood, StateSpaceFit, maximise
 from srfcli.laws.registry import bundled_registry
 from srfcli.laws.values import Effect
 from srfcli.validation.blind import Answer, read_answers
-from srfcli.validation.cases import EFFECTS, known_physics, unseal
+from srfcli.validation.cases import EFFECTS, recipe_of, unseal
 
 RTOL = 1e-4  # tolerance of the integration
 LAWS = {  # a law's parameter: the field of the truth
@@ -78,7 +78,7 @@ def candidate(search: ModelSearch, name: str, truth: Any, run: str) -> Effect:
 
 def right_hypothesis(search: ModelSearch, concealed: dict[str, Any]) -> Hypothesis:
     """Return the hypothesis that holds what is concealed; SrfError where it is not registered."""
-    laws, truth = [n for n in concealed["effects"] if n in search.laws], known_physics(concealed)
+    laws, truth = [n for n in concealed["effects"] if n in search.laws], recipe_of(concealed).physics
     run = concealed.get("only") or ""
     return Hypothesis(tuple(candidate(search, n, truth, run) for n in concealed["effects"] if n not in laws), "".join(laws))
 
@@ -95,9 +95,9 @@ def right_problem(folder: Path, concealed: dict[str, Any]) -> tuple[ModelSearch,
 
 def fitted(folder: Path, concealed: dict[str, Any]) -> tuple[str, float, float, float, bool]:
     """Return the model that holds what is concealed, its log evidence and likelihood, `white`, whether it saw all readings."""
-    truth, (search, hypothesis, problem) = known_physics(concealed), right_problem(folder, concealed)
+    truth, (search, hypothesis, problem) = recipe_of(concealed).physics, right_problem(folder, concealed)
     likelihood = Likelihood(problem, processes=PROCESSES.get(concealed["noise"], ("relaxation",)), rtol=RTOL)
-    values, stated = likelihood.values(likelihood.start), known_physics(concealed, baseline=True)
+    values, stated = likelihood.values(likelihood.start), recipe_of(concealed).baseline
     values |= {n: float(getattr(stated, LAWS[n])) for n in problem.names if n in LAWS and getattr(stated, LAWS[n])}
     for effect in hypothesis.effects:
         longs = {p.name: long for long, p in own_parameters(effect, problem.model).items()}

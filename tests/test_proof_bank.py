@@ -21,6 +21,7 @@ from srfcli.validation.apparatus import (
     PAPER,
     PROTOCOLS,
     RIG_SHARES,
+    RIGS,
     WRONG_AGEING,
     Setting,
     critical_spring,
@@ -33,18 +34,14 @@ from srfcli.validation.cases import (
     PAPER_KINDS,
     SEAL,
     WIDE_KINDS,
-    acting,
     check_cases,
     draw_recipe,
     draw_wide,
-    known_gauge,
-    known_physics,
-    known_plans,
-    known_rig,
     make_bank,
     make_case,
     noiseless_record,
     plan_bank,
+    recipe_of,
     seal,
     unseal,
 )
@@ -67,8 +64,9 @@ def contents(folder):
 )
 def test_every_case_reads_back_and_gives_nothing_away(tmp_path, name):
     truth = make_case(tmp_path / "c", 7, **QUICK, effects=[name] if name else [], size=0.8, rough=False)
+    recipe = recipe_of(truth)
     experiment = read_experiment(tmp_path / "c", registry=load_registry())
-    p, baseline = known_physics(truth), known_physics(truth, baseline=True)
+    p, baseline = recipe.physics, recipe.baseline
     assert truth["verdict"] == ("none" if not name else "identified" if name in NAMES else "unknown")
     assert (p == baseline) == (name is None)
     assert experiment.choice.law in LAWS
@@ -78,11 +76,11 @@ def test_every_case_reads_back_and_gives_nothing_away(tmp_path, name):
     fitted = {q.name for q in experiment.parameters if not q.fixed}
     lacking = ({"lambda"} if baseline.rigid else set()) | ({"Vsat"} if baseline.bare else set())
     assert fitted == set(PAPER.start(Physics())) - lacking
-    for run, plan in zip(experiment.runs, known_plans(truth), strict=True):
+    for run, plan in zip(experiment.runs, recipe.plans, strict=True):
         assert run.used.all()
         assert {n.kind for n in run.notices} <= ({"quantisation"} if truth["gauge"]["lag1"] else set())
         assert np.allclose(run.load.rest(0.0), plan.W0)
-        left = rms(run.observed - noiseless_record(known_rig(truth), acting(truth, plan), plan)) / NOISE
+        left = rms(run.observed - noiseless_record(RIGS[recipe.rig], recipe.acting(plan), plan)) / NOISE
         assert 0.75 < left < 1.25
     text = b" ".join(contents(tmp_path / "c").values()).decode()
     assert not [n for n in (*NAMES, *OUTSIDE_NAMES, "effect", "rough", "seed") if n != "inertia" and n in text]
@@ -172,20 +170,21 @@ def test_a_case_of_the_wide_bank_reads_back(tmp_path, setting, noise):
     kind = "none" if setting.ageing == setting.stated else "ageing"
     choice = {"setting": setting, "noise": noise, "kind": kind, "rough": False}
     truth = make_case(tmp_path / "c", 12, **choice, bank="wide")
+    recipe = recipe_of(truth)
     experiment = read_experiment(tmp_path / "c", registry=load_registry())
-    choice, rig, gauge = experiment.choice, known_rig(truth), known_gauge(truth)
+    choice, rig, gauge = experiment.choice, RIGS[recipe.rig], recipe.gauge
     assert (choice.law, choice.ageing, truth["protocol"], truth["noise"]) == (
         setting.law, setting.stated, setting.protocol, noise,
     )  # fmt: skip
     assert truth["effects"] == ([] if kind == "none" else ["ruina"]) and truth["kind"] == kind
     assert truth["accept"] == ([] if kind == "none" else ["slip-evolution"])
-    for run, plan in zip(experiment.runs, known_plans(truth), strict=True):
-        made = noiseless_record(rig, acting(truth, plan), plan) * (rig.factor if rig.observes == "force" else 1.0)
+    for run, plan in zip(experiment.runs, recipe.plans, strict=True):
+        made = noiseless_record(rig, recipe.acting(plan), plan) * (rig.factor if rig.observes == "force" else 1.0)
         unit = gauge.louder(plan.loud).sigma * (rig.factor if rig.observes == "force" else 1.0)
         assert run.observable == rig.observes and np.allclose(run.t, plan.times(), atol=1e-6)
         assert 0.6 < rms((run.observed - made)[run.used]) / unit < 1.5  # 1/f noise of a short run wanders
         assert rms(run.load(run.t)[0] - [plan.load()(t)[0] for t in run.t.tolist()]) < 2e-3 * plan.W0
-    louder = [plan.loud for plan in known_plans(truth) if plan.loud > 1 and not plan.holdout]
+    louder = [plan.loud for plan in recipe.plans if plan.loud > 1 and not plan.holdout]
     assert len(louder) == (noise == "one run louder")
     text = b" ".join(contents(tmp_path / "c").values()).decode()
     assert not [n for n in (*NAMES, *OUTSIDE_NAMES, "effect", "rough", "seed", "truth") if n != "inertia" and n in text]
@@ -236,15 +235,16 @@ def test_an_effect_in_one_run_leaves_the_others_alone(tmp_path):
     setting = Setting("rock", "load-steps", "dieterich-ruina", "dieterich", "dieterich")
     choice = {"setting": setting, "noise": "white", "kind": "one-run", "effects": ["tangential-crosstalk"], "size": 1.0}
     truth = make_case(tmp_path / "c", 4, **choice, rough=False, bank="wide")
+    recipe = recipe_of(truth)
     assert truth["verdict"] == "identified" and truth["accept"] == ["unknown"]
-    rig, without = known_rig(truth), known_physics(truth, baseline=True)
+    rig, without = RIGS[recipe.rig], recipe.baseline
     moved = {
-        plan.name: rms(noiseless_record(rig, acting(truth, plan), plan) - noiseless_record(rig, without, plan))
-        for plan in known_plans(truth)
+        plan.name: rms(noiseless_record(rig, recipe.acting(plan), plan) - noiseless_record(rig, without, plan))
+        for plan in recipe.plans
     }
-    assert truth["only"] in ("first", "second") and moved[truth["only"]] > known_gauge(truth).sigma
+    assert truth["only"] in ("first", "second") and moved[truth["only"]] > recipe.gauge.sigma
     assert {name for name, change in moved.items() if change} == {truth["only"]}
-    acts = {plan.name: acting(truth, plan) != known_physics(truth, baseline=True) for plan in known_plans(truth)}
+    acts = {plan.name: recipe.acting(plan) != recipe.baseline for plan in recipe.plans}
     assert [name for name, acting_there in acts.items() if acting_there] == [truth["only"]]
 
 
@@ -253,7 +253,7 @@ def test_the_same_seed_makes_the_same_case_of_the_wide_bank(tmp_path):
     made = [make_case(tmp_path / name, 3, **choice, effects=["drive-ripple"], bank="wide") for name in "ab"]
     assert contents(tmp_path / "a") == contents(tmp_path / "b") and json.dumps(made[0]) == json.dumps(made[1])
     again = json.loads(json.dumps(made[0], allow_nan=False))
-    assert known_plans(again) == known_plans(made[0]) and known_physics(again) == known_physics(made[0])
+    assert recipe_of(again) == recipe_of(made[0])
 
 
 def test_effects_that_go_together_nowhere_are_told(tmp_path):

@@ -593,42 +593,19 @@ def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
     }
 
 
-def known_physics(truth: Mapping[str, Any], *, baseline: bool = False) -> Physics:
-    """Return the slider that a truth describes, or the one that its stated model describes."""
-    values = dict(truth["baseline" if baseline else "physics"])
-    return Physics(**{**values, "track": Track(**values["track"])})
-
-
-def known_plans(truth: Mapping[str, Any]) -> tuple[Plan, ...]:
-    """Return the runs of a case from the truth about it."""
-    return tuple(Plan(**{**r, **{n: tuple(map(tuple, r.get(n, ()))) for n in ("drive", "steps", "gaps")}}) for r in truth["runs"])
-
-
-def concealed(truth: Mapping[str, Any]) -> list[Effect]:
-    """Return the effects of a truth; of several forms of one, the form that the truth has."""
+def recipe_of(truth: Mapping[str, Any]) -> Recipe:
+    """Return the case that a truth describes; of several forms of an effect, the form that the truth has."""
+    physics, baseline = (Physics(**{**p, "track": Track(**p["track"])}) for p in (truth["physics"], truth["baseline"]))
+    pairs = ("drive", "steps", "gaps")
+    plans = tuple(Plan(**{**run, **{n: tuple(map(tuple, run.get(n, ()))) for n in pairs}}) for run in truth["runs"])
     if truth.get("kind") == "ageing":
-        return [other_ageing(truth["effects"][0], known_physics(truth, baseline=True).ageing_name)]
-    found = []
-    for name in truth["effects"]:
-        forms = variants(name)
-        found.append(next((e for e in forms if len(forms) == 1 or e.varies in truth["truth"]), forms[0]))
-    return found
-
-
-def known_rig(truth: Mapping[str, Any]) -> Rig:
-    """Return the rig of a case from the truth about it."""
-    return RIGS[truth.get("rig", "paper")]
-
-
-def acting(truth: Mapping[str, Any], plan: Plan) -> Physics:
-    """Return what is true in one run of a case."""
-    p, only = known_physics(truth), truth.get("only", "")
-    return p if only in ("", plan.name) else without(p, concealed(truth))
-
-
-def known_gauge(truth: Mapping[str, Any]) -> Gauge:
-    """Return the gauge of a case from the truth about it."""
-    return Gauge(**truth["gauge"])
+        effects = [other_ageing(truth["effects"][0], baseline.ageing_name)]
+    else:
+        forms = [variants(name) for name in truth["effects"]]
+        effects = [next((e for e in some if len(some) == 1 or e.varies in truth["truth"]), some[0]) for some in forms]
+    told = {name: truth[name] for name in ("kind", "rig", "protocol", "noise", "only") if name in truth}
+    gauge = Gauge(**truth["gauge"])
+    return Recipe(tuple(effects), tuple(truth["sizes"].values()), physics, baseline, plans, gauge, **told)
 
 
 # Truths under seal: a salted digest is published with the cases, the truths are kept apart until the answers are in.

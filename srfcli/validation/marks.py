@@ -24,21 +24,9 @@ from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis.search import LOG_BAYES_MARGIN
 from srfcli.laws.registry import load_registry
 from srfcli.results.tables import Column, Table
-from srfcli.validation.apparatus import PAPER, Rig, free_fields
+from srfcli.validation.apparatus import PAPER, RIGS, Rig, free_fields
 from srfcli.validation.blind import FAILED, VERDICTS, Answer
-from srfcli.validation.cases import (
-    EFFECTS,
-    WIDE_KINDS,
-    Effect,
-    acting,
-    concealed,
-    known_gauge,
-    known_physics,
-    known_plans,
-    known_rig,
-    noiseless_record,
-    without,
-)
+from srfcli.validation.cases import EFFECTS, WIDE_KINDS, Effect, noiseless_record, recipe_of, without
 from srfcli.validation.gauge import Gauge, white
 from srfcli.validation.slider import Physics, Plan, critical_load
 
@@ -145,12 +133,12 @@ def setting_of(truth: Mapping[str, Any]) -> Mapping[str, str]:
     """Return what a case was set in, by kind of circumstance; nothing for a truth that does not say."""
     if "rig" not in truth:
         return {}
-    p, baseline = known_physics(truth), known_physics(truth, baseline=True)
+    recipe = recipe_of(truth)
     return {
         "apparatus": truth["rig"],
         "protocol": truth["protocol"],
-        "friction law": baseline.law_name,
-        "ageing law": p.ageing_name,
+        "friction law": recipe.baseline.law_name,
+        "ageing law": recipe.physics.ageing_name,
         "noise": truth["noise"],
         "field": "none" if not truth["rough"] else "one per run" if truth.get("own_track") else "one for all runs",
     }
@@ -238,10 +226,11 @@ Task = tuple[Path, Mapping[str, Any]]
 def detectability_of(task: Task) -> Detectability:
     """Return what there was to be seen in one case: its folder, and the truth about it."""
     folder, truth = task
-    gauge, rig = known_gauge(truth), known_rig(truth)
+    recipe = recipe_of(truth)
+    rig, effects = RIGS[recipe.rig], recipe.effects
     experiment = read_experiment(folder, registry=load_registry())
     held = {run.name: run for run in experiment.runs if run.holdout}
-    sliders = {plan: acting(truth, plan) for plan in known_plans(truth)}
+    sliders = {plan: recipe.acting(plan) for plan in recipe.plans}
     known = {}
     for plan, p in sliders.items():
         if plan.name in held:
@@ -249,9 +238,9 @@ def detectability_of(task: Task) -> Detectability:
             made = noiseless_record(rig, p, plan) * (rig.factor if rig.observes == "force" else 1.0)
             known[plan.name] = float(np.sqrt(np.mean((run.observed - made)[run.used] ** 2)))
     fitted = {plan: p for plan, p in sliders.items() if not plan.holdout}
-    effects = concealed(truth)
     stands = {
-        e.name: effect_standard_errors(e, [o for o in effects if o is not e], fitted, gauge=gauge, rig=rig) for e in effects
+        e.name: effect_standard_errors(e, [o for o in effects if o is not e], fitted, gauge=recipe.gauge, rig=rig)
+        for e in effects
     }
     return Detectability(folder.name, known, {n: s for n, (s, _) in stands.items()}, {n: r for n, (_, r) in stands.items()})
 
@@ -344,10 +333,11 @@ def load_errors(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float]
     """
     if not answer.loads:
         return None
-    p, plans = known_physics(truth), known_plans(truth)
-    p = without(p, concealed(truth)) if truth.get("only") else p  # elsewhere it is no part of the system
+    recipe = recipe_of(truth)
+    p, W0 = recipe.physics, recipe.plans[0].W0
+    p = without(p, recipe.effects) if recipe.only else p  # elsewhere it is no part of the system
     V, ours, base = (np.array(answer.loads[name], dtype=float) for name in ("V", "augmented", "baseline"))
-    true = np.array([critical_load(p, v, 1e-3 * plans[0].W0, 1e3 * plans[0].W0) for v in V.tolist()])
+    true = np.array([critical_load(p, v, 1e-3 * W0, 1e3 * W0) for v in V.tolist()])
     there = np.isfinite(true) & np.isfinite(ours) & np.isfinite(base)
     if not there.any():
         return None
