@@ -31,10 +31,7 @@ OWN_RECORD = {  # options that describe a new record; they exclude EXPERIMENT, w
     "V": "--V", "W0": "--W0", "eps": "--eps", "drive": "--drive", "load": "--load", "load_file": "--load-file",
     "onset": "--onset", "duration": "--for", "rate": "--rate", "observable": "--observe", "free": "--free",
 }  # fmt: skip
-PROGRAM = (
-    *(name for name in OWN_RECORD if name not in ("V", "W0", "eps")),
-    "load_rise",
-)  # options that are no parameter of the slider
+PROGRAM = ("load_rise", *(n for n in OWN_RECORD if n not in ("V", "W0", "eps")))  # those that are no parameters of the slider
 EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load_file"), ("load", "load_file"))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from srfcli.codegen.model import Array, GeneratedModel, open_model
-from srfcli.codegen.slider import Opener, SlidingSystem, check_effects, declared
+from srfcli.codegen.slider import SlidingSystem, check_effects, declared
 from srfcli.codegen.splines import appended
 from srfcli.core.errors import SrfError, Status, as_pairs, did_you_mean, explained, worst
 from srfcli.core.settings import Parameter, check_value, require_parameter
@@ -449,7 +449,9 @@ def record_as_told(
         observables=observables,
         on=on,
     )
-    choice, described, modulation = _choice(opener), system.described(), work.jobs[0].modulation
+    law, ageing, interface = _placed([opener.names[key] for key in ("law", "ageing", "interface")])
+    choice = ModelChoice(law, ageing, interface, opener.names["inertia"], _placed(opener.effects))
+    described, modulation = system.described(), work.jobs[0].modulation
     for name, text, unit in (("V", drive, "s:um/s"), ("W0", load or load_file, "s:N")):
         if text is not None:
             described[name] = {"value": str(text), "unit": unit, "origin": "flag"}
@@ -467,14 +469,8 @@ def record_as_told(
     )
 
 
-def _choice(opener: Opener) -> ModelChoice:
-    """Return the laws by name, a file by its whole path: one relative to here means nothing in an experiment's folder."""
-    law, ageing, interface = _placed([opener.names[key] for key in ("law", "ageing", "interface")])
-    return ModelChoice(law, ageing, interface, opener.names["inertia"], _placed(opener.effects))
-
-
 def _placed(names: Sequence[str]) -> tuple[str, ...]:
-    """Return names of laws, a file's as its whole path."""
+    """Return names of laws, a file's as its whole path: one relative to here means nothing in an experiment's folder."""
     return tuple(str(Path(name).resolve()) if name.endswith(LAW_FILES) else name for name in names)
 
 
