@@ -1,22 +1,20 @@
-"""Stick-slip alone: a sealed trial of it, and from how far its fits converge with a limit to what a reading may move.
+"""Stick-slip alone: a sealed trial of it, and from how far its fits converge.
 
-    python benchmarks/stick_slip.py FOLDER [--cases N] [--seed SEED] [--limits 3,inf,...] [--workers N]
+    python benchmarks/stick_slip.py FOLDER [--cases N] [--seed SEED] [--fits] [--workers N]
 
 FOLDER becomes a sealed trial of the wide bank in which each run sticks and slips, about one case in thirty of that bank. Effects
 that act by a load that changes have none there; their cases are drawn anew. `search_steps.py FOLDER` with the same numbers
 answers it, and `srf prove --report-only FOLDER` marks it.
 
-With `--limits` the truths are read, and the right model of each case is fitted from the file's start values and from others, A,
-B and D0 off by a quarter at random: the first steps of a fit, under one wide field after the other, as a fit chooses them. Each
-limit takes the place of MAX_UPDATE, inf is none. Reached is what ends within NEAR of the likeliest maximum
-that any of these finds.
+With `--fits` the truths are read, and the right model of each case is fitted from the file's start values and from others, A,
+B and D0 off by a quarter at random: the first steps of a fit, under one wide field after the other, as a fit chooses them.
+Reached is what ends within NEAR of the likeliest maximum that any of these finds.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,6 @@ from common import Report
 
 from srfcli.core.errors import SrfError
 from srfcli.diagnosis.search import SEARCH_RTOL
-from srfcli.inference import state_space
 from srfcli.inference.state_space import SCORING_STEPS, Likelihood, maximise_from_starts, wide_starts
 from srfcli.validation import apparatus, cases
 from srfcli.validation.cases import CaseRequest, Recipe, unseal
@@ -37,7 +34,7 @@ from srfcli.validation.trials import Trial, begin
 OFF = 0.25  # standard deviation of the logarithms of A, B and D0 in other starts
 STARTS = 2  # of each case, the file's among them
 NEAR = 10.0  # in log likelihood, as another field may stand beside white noise alone
-Reached = dict[str, list[tuple[float, float]]]
+Reached = list[tuple[float, float]]
 
 
 def drawn(trial: Path, n: int, seed: int) -> Trial:
@@ -60,9 +57,9 @@ def drawn(trial: Path, n: int, seed: int) -> Trial:
         apparatus.PROTOCOLS.update(shares)
 
 
-def fitted(case: tuple[Path, dict[str, Any], tuple[str, ...]]) -> Reached | str:
-    """Return by limit what each start reaches in log likelihood, and its CPU; a reason where the right model cannot be made."""
-    folder, concealed, limits = case
+def fitted(case: tuple[Path, dict[str, Any]]) -> Reached | str:
+    """Return what each start reaches in log likelihood, and its CPU; a reason where the right model cannot be made."""
+    folder, concealed = case
     try:
         likelihood = Likelihood(right_problem(folder, concealed)[2], rtol=SEARCH_RTOL)
     except SrfError as error:
@@ -72,11 +69,7 @@ def fitted(case: tuple[Path, dict[str, Any], tuple[str, ...]]) -> Reached | str:
     for _ in range(STARTS - 1):
         off = {n: float(np.exp(OFF * rng.standard_normal())) for n in ("A", "B", "D0") if n in file}
         starts.append(starts[0] | {n: file[n] * factor for n, factor in off.items()})
-    found: Reached = {}
-    for limit in limits:
-        setattr(state_space, "MAX_UPDATE", min(float(limit), 1e12))  # noqa: B010
-        found[limit] = [_reached(likelihood, start) for start in starts]
-    return found
+    return [_reached(likelihood, start) for start in starts]
 
 
 def _reached(likelihood: Likelihood, start: dict[str, float]) -> tuple[float, float]:
@@ -87,48 +80,38 @@ def _reached(likelihood: Likelihood, start: dict[str, float]) -> tuple[float, fl
     return found.point.log_likelihood if found else -np.inf, time.process_time() - since
 
 
-def _cases(trial: Trial, limits: tuple[str, ...]) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...]]]:
-    for case, concealed in sorted(unseal(trial.bank, trial.apart).items()):
-        if concealed["kind"] != "outside":
-            yield trial.bank / case, concealed, limits
-
-
 def main() -> None:
-    """Draw the trial; with limits, print how many starts of the right models reach the likeliest maximum under each."""
+    """Draw the trial; with fits, print how many starts of the right models reach the likeliest maximum."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--cases", type=int, default=30)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--limits", default="")
+    parser.add_argument("--fits", action="store_true")
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     trial = drawn(given.folder, given.cases, given.seed)
     print(f"SHA-256 of the sealed truths: {trial.digest()}", flush=True)
-    limits = tuple(given.limits.split(",")) if given.limits else ()
-    if not limits:
+    if not given.fits:
         return
     report = Report("stick_slip", __doc__ or "")
-    every: list[Reached] = []
-    known = list(_cases(trial, limits))
+    known = [
+        (trial.bank / case, told) for case, told in sorted(unseal(trial.bank, trial.apart).items()) if told["kind"] != "outside"
+    ]
+    rows, every = [], []
     with ProcessPoolExecutor(given.workers) as pool:
-        for (folder, concealed, _), found in zip(known, pool.map(fitted, known), strict=True):
+        for (folder, concealed), found in zip(known, pool.map(fitted, known), strict=True):
             if isinstance(found, str):
                 continue
             every.append(found)
-            heights = {limit: [round(height, 1) for height, _ in some] for limit, some in found.items()}
-            print(f"{folder.name}: {concealed['rig']}, {'+'.join(concealed['effects']) or 'none'}: {heights}", flush=True)
-    tops = [max(height for some in found.values() for height, _ in some) for found in every]
-    report.say(f"stick-slip of seed {given.seed}, digest {trial.digest()}: {len(every)} right models, {STARTS} starts of each\n")
-    rows = []
-    for limit in limits:
-        near = [[height > top - NEAR for height, _ in found[limit]] for found, top in zip(every, tops, strict=True)]
-        cpu = [cpu for found in every for _, cpu in found[limit]]
-        rows.append((
-            limit, str(sum(some[0] for some in near)), f"{100 * np.mean(near):.0f} %", str(sum(any(some) for some in near)),
-            str(sum(height == -np.inf for found in every for height, _ in found[limit])), f"{np.mean(cpu):.1f} s",
-        ))  # fmt: skip
-    header = ("a reading moves by", "reached from the file", "from all", "models reached", "cannot be followed", "CPU a fit")
-    report.table(header, rows)
+            heights = [f"{height:.1f}" for height, _ in found]
+            cpu = "  ".join(f"{cpu:.0f}" for _, cpu in found)
+            rows.append((folder.name, concealed["rig"], "+".join(concealed["effects"]) or "none", *heights, cpu))
+            print(*rows[-1], flush=True)
+    near = [[height > max(found)[0] - NEAR for height, _ in found] for found in every]
+    mean = np.mean([cpu for found in every for _, cpu in found])
+    report.say(f"stick-slip of seed {given.seed}, digest {trial.digest()}: {len(every)} right models, {STARTS} starts of each;")
+    report.say(f"{sum(n[0] for n in near)} reached from the file, {100 * np.mean(near):.0f} % of all, in {mean:.1f} s of CPU\n")
+    report.table(("case", "rig", "model", "from the file", "from others", "CPU (s)"), rows)
 
 
 if __name__ == "__main__":

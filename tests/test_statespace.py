@@ -182,40 +182,6 @@ def test_derivatives_are_those_of_the_likelihood(rig):
     assert max(worst.values()) < 1e-3, worst  # stick-slip is the worst, and there the differences are
 
 
-def test_a_reading_moves_logarithms_and_field_no_farther_than_is_linear(make_model):
-    """A sudden fall that the model has not: velocity and age stay what can be followed, and derivatives exact."""
-    own, model = RIGS["paper"], make_model(**PMMA, random_field=True)
-    y = predict(model, own.experiment, own.run, own.values, rtol=1e-9).y
-    fallen = replace(own, run=replace(own.run, observed=np.where(own.run.t < 0.3, y, 0.1 * y)))
-    values = own.values | FIELD | {"gauge_white": 0.01}
-
-    def filtered(changed: dict[str, float], by: tuple[str, ...] = (), keep: bool = False) -> Any:
-        return filter_run(model, fallen.experiment, fallen.run, values | changed, by=by, rtol=1e-8, keep=keep, farthest=1.0)
-
-    by = ("A", "B", "D0", "field_amplitude")
-    exact, found = filtered({}, by).found, filtered({}, keep=True).found
-    kept, fall, states = found.kept, int(np.argmax(fallen.run.t >= 0.3)), list(model.states)
-    assert exact.reached == fallen.run.t.size and 0 < exact.bounded < fallen.run.t.size
-    t, shown = (np.insert(a, fall, a[fall]) for a in (fallen.run.t, fallen.run.observed))
-    twice = recording(t, "elongation", STEPS, ConstantLoad(5.0), observed=shown)
-    again = filter_run(model, fallen.experiment, twice, values, rtol=1e-8, keep=True, farthest=1.0).found.kept
-    free = kept.covariance[fall] @ kept.gradient[fall] / found.S[fall]  # the gain that leaves the least variance
-    for name, most in (("ln_v", 1.0), ("field", 1.0 * FIELD["field_amplitude"])):
-        i = states.index(name)
-        assert abs(free[i] * found.nu[fall]) > 1.3 * most and kept.gain[fall, i] == 0
-        moved = again.mean[fall + 1, i] - kept.mean[fall, i]  # the same reading once more, before it is used
-        assert moved == pytest.approx(np.copysign(most, free[i] * found.nu[fall]))
-    u = states.index("u")
-    assert kept.gain[fall, u] == pytest.approx(free[u])
-    before = fall - 1
-    assert np.allclose(kept.gain[before], kept.covariance[before] @ kept.gradient[before] / found.S[before])
-    for j, name in enumerate(by):
-        step = 1e-6 * values[name]
-        sides = [filtered({name: values[name] + sign * step}).found for sign in (1, -1)]
-        for ours, theirs in ((exact.nu_d, sides[0].nu - sides[1].nu), (exact.S_d, sides[0].S - sides[1].S)):
-            assert np.abs(ours[:, j] - theirs / (2 * step)).max() < 1e-3 * np.abs(theirs / (2 * step)).max(), name
-
-
 def test_a_fall_that_comes_as_a_surprise_is_followed(make_model):
     """The equations are linearised again where the reading leads: no limit is needed, and derivatives are those of the whole."""
     own, model = RIGS["paper"], make_model(**PMMA, random_field=True)
@@ -227,7 +193,7 @@ def test_a_fall_that_comes_as_a_surprise_is_followed(make_model):
 
     by = ("A", "B", "D0", "field_amplitude", "field_length", "gauge_white")
     exact = filtered({}, by)
-    assert exact.reached == run.t.size and exact.bounded == 0
+    assert exact.reached == run.t.size
     for j, name in enumerate(by):
         step = 1e-6 * values[name]
         sides = [filtered({name: values[name] + sign * step}) for sign in (1, -1)]

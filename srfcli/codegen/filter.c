@@ -782,32 +782,29 @@ static int relinearise(const Recording *run, int k, const Place *was, Place *at,
 
 /* One run: innovations nu (nt), their variances S (nt) and the derivatives of both (nt, LANES), at the readings where `used`; all
    get the mean (nt, na), covariance (nt, na, na), transition (nt, na, na) from the reading before and the reading's gradient (nt,
-   na), before they are used, and how states follow it (nt, na), 0 if held, where those are wanted. Several signals may be read at
-   one time: `t` (nt) does not fall, and `signal` (nt) says which it is. A reading is `factor` times what it `shows` (nt) plus
+   na), before they are used, and how states follow it (nt, na), where those are wanted. Several signals may be read at one time: `t` (nt) does not fall, and `signal` (nt) says which it is. A reading is `factor` times what it `shows` (nt) plus
    offset plus gauge noise of variance R: GAUGE the elongation as the gauge has it, SPRING as it is, where spring weighs by
    `weighs` (nt), 0 or 1, with which parameter `weighed` is replaced (-1 for none); from 0 on a state. The processes of coloured
    noise have `order` (ng) states each, belong to the signal `owner` (ng), and have parameters gauge (rates, ng, 3); which of the
-   rates holds at a reading is `rate` (nt): where it changes, a noise begins that owes nothing to the one before. A reading moves
-   no state by more than `farthest` (NX). The states that are logarithms are those where `logarithm` (NX) is 1; `linear` (2) says how
+   rates holds at a reading is `rate` (nt): where it changes, a noise begins that owes nothing to the one before. The states that are logarithms are those where `logarithm` (NX) is 1; `linear` (2) says how
    far a reading may move them, and how much a reading over its white noise may then differ from its tangent, before the equations are
    linearised again. p holds dual numbers
-   (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset, R (nt) and farthest. Returns how many readings were reached; stats: steps, rejected, readings that
-   were held to `farthest`, readings about which the equations were linearised again. */
-int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, const double *farthest, const int *logarithm, const double *linear, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *gains, double *stats, const volatile int *stop) {
+   (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset and R (nt). Returns how many readings were reached, and the
+   `steps` of integration that it took. */
+int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, const int *logarithm, const double *linear, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *gains, double *steps, const volatile int *stop) {
     double values[NP];
-    dual q[NP], one, bound[NX];
+    dual q[NP], one;
     Course course = {values, q, slopes, keep, ng, NX, 0, 0, order, rtol, 0.0, 0.0, atol, {{0.0}, 0.0, 0.0, 0.0, 0}, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
     Recording run = {n_segments, edges, drive, longest, range, t, observed, weighs, factor, offset, R, gauge, rate, signal, shows, used, logarithm, linear, weighed, {0}, values, q};
     Place at = {{n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values}, {{0.0}, 0.0, 0.0, 0.0, 0}, 0.0, 0.0, t[0], -1};
     Belief b, from;
     Expected e;
-    int na, filled = 0, bounded = 0, relinearised = 0;
+    int na, filled = 0;
     memset(&b, 0, sizeof b);
     for (int i = 0; i < NP; i++) TAKE(q[i], p + i * wide), values[i] = q[i].v;
     for (int j = 0; j < ng; j++) run.begins[course.na] = 1 + owner[j], course.na += order[j];
     na = course.na;
     for (int i = 0; i < NX; i++) TAKE(one, x0 + i * wide), b.x[i] = one.v, b.xd[i] = one.d;
-    for (int i = 0; i < NX; i++) TAKE(bound[i], farthest + i * wide);
     for (int i = 0; i < NX; i++)
         for (int j = 0; j < NX; j++) TAKE(one, P0 + (i * NX + j) * wide), b.P[i * na + j] = one.v, b.Pd[i * na + j] = one.d;
     for (int k = 0; k < nt; k++) {
@@ -817,10 +814,8 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
         begin_transition(&course, &b);
         if (!reach(&run, k, &at, &course, &b)) goto end;
         expect(&run, k, &at, &course, &b, NULL, &e);
-        if (interval && bent(&run, k, &was, &at, &course, &from, &b, &e)) {
-            if (!relinearise(&run, k, &was, &at, &course, &from, &b, &e)) goto end;
-            relinearised++;
-        }
+        if (interval && bent(&run, k, &was, &at, &course, &from, &b, &e) && !relinearise(&run, k, &was, &at, &course, &from, &b, &e))
+            goto end;
         nu[k] = e.miss;
         S[k] = e.variance;
         memcpy(nu_d + (size_t)k * LANES, &e.dmiss, sizeof e.dmiss);
@@ -834,30 +829,20 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
         }
         filled = k + 1;
         if (!used[k] || !(e.variance > 0.0)) continue;
-        int far = 0;
         for (int i = 0; i < na; i++) {
             double gain = e.PH[i] / e.variance, move = gain * e.miss;
             lanes dgain = (e.dPH[i] - gain * e.dvariance) / e.variance, dmove = dgain * e.miss + gain * e.dmiss;
-            int held = i < NX && fabs(move) > bound[i].v; /* the equations are not linear so far */
             if (slopes) {
                 for (int j = 0; j < na; j++) add_scaled(LANES, -e.PH[j], &dgain, b.Pd + i * na + j);
                 add_scaled(na * LANES, -gain, e.dPH, b.Pd + i * na);
             }
             for (int j = 0; j < na; j++) b.P[i * na + j] -= gain * e.PH[j];
-            if (held) {
-                dmove = move < 0.0 ? -bound[i].d : bound[i].d;
-                move = copysign(bound[i].v, move);
-                far = 1;
-            } else if (keep) gains[(size_t)k * na + i] = gain;
+            if (keep) gains[(size_t)k * na + i] = gain;
             b.xd[i] += dmove;
             b.x[i] += move;
         }
-        bounded += far;
     }
 end:
-    stats[0] = course.steps;
-    stats[1] = course.rejected;
-    stats[2] = bounded;
-    stats[3] = relinearised;
+    *steps = course.steps;
     return filled;
 }

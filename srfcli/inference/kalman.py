@@ -76,7 +76,7 @@ class SmootherInput:
     """What the smoother needs, before each reading is used: mean (n, a), covariance, transition since the one before (n, a, a).
 
     a is the number of states with those of the gauge noise after them; `gradient` (n, a) is that of the reading, `gain` (n, a)
-    by how much the states follow its innovation, zero where it is not used and where they are held.
+    by how much the states follow its innovation, zero where it is not used.
     """
 
     mean: Array
@@ -88,10 +88,7 @@ class SmootherInput:
 
 @dataclass(frozen=True)
 class Innovations:
-    """Innovations `nu` (n,), their variances `S` (n,), and the derivatives of both (n, k); NaN after `reached` readings.
-
-    `bounded` readings would have moved the state farther than they may.
-    """
+    """Innovations `nu` (n,), their variances `S` (n,), and the derivatives of both (n, k); NaN after `reached` readings."""
 
     nu: Array
     S: Array
@@ -99,7 +96,6 @@ class Innovations:
     S_d: Array
     reached: int
     steps: int
-    bounded: int
     kept: SmootherInput | None
 
 
@@ -119,7 +115,6 @@ def kalman_filter(
     atol: Array,
     keep: bool,
     most: int | None,
-    farthest: float,
 ) -> Innovations:
     """Return the innovations of the readings.
 
@@ -127,11 +122,8 @@ def kalman_filter(
     `gauge` (rates, g, 3) has their parameters: of one state, e' = -e/tau + s sqrt(2/tau) w, (tau, s, -); of two, an oscillator of
     frequency f (Hz), quality q and standard deviation s, (f, s, q). Where a reading has another row, a new noise begins.
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
-    numbers in the same k directions. A reading moves ln v and ln PHI by no more than `farthest`, and the field by as many of its
-    standard deviations, as what it says of them is linear: beside the fall of a stick-slip cycle that may be a velocity of any
-    size, which cannot be followed. Each reading is still predicted from those before it alone, so that the likelihood is one.
-    Where one moves them by more than LINEAR_MOVE, and what it then shows is not on its tangent, the equations are linearised
-    again.
+    numbers in the same k directions. Where a reading moves ln v or ln PHI by more
+    than LINEAR_MOVE, and what it then shows is not on its tangent, the equations are linearised again.
     After `most` steps, 50 a sample if that is None, the rest is NaN. Raises SrfError without a compiler, or for a model without a
     random friction field.
     """
@@ -151,10 +143,10 @@ def kalman_filter(
     shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide), (n, wide)) if keep else ((1,),) * 5
     arrays = [np.full(shape, np.nan) for shape in shapes]
     logarithm, linear = integers(np.char.startswith(model.states, "ln_")), doubles(np.array([LINEAR_MOVE, NONLINEARITY]))
-    stats, stop, reached = np.zeros(4), ctypes.c_int(0), n
+    steps, stop, reached = np.zeros(1), ctypes.c_int(0), n
     imposed, use = imposed_arguments(read.t, drive, load), np.ascontiguousarray(read.used, dtype=np.uint8)
     size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000) if most is None else most
-    allowed, bounds = np.asarray(atol) * size / rtol, _bounds(model, p, farthest)
+    allowed = np.asarray(atol) * size / rtol
     for first in range(0, max(k, 1), LANES):
         own_nu, own_S = np.full((n, LANES), np.nan), np.full((n, LANES), np.nan)
         keeping = keep and first == 0
@@ -163,24 +155,14 @@ def kalman_filter(
             len(order), orders, owners, doubles(gauge.packed(first)), rates, number, shows, doubles(read.weighs), weighed,
             int(k > 0), ctypes.c_double(size), doubles(allowed), ctypes.c_long(most), n, doubles(read.t), doubles(read.observed),
             ctypes.c_void_p(use.ctypes.data), doubles(read.factor.packed(first)), doubles(read.offset.packed(first)),
-            doubles(read.R.packed(first)), doubles(bounds.packed(first)), logarithm, linear, int(keeping), doubles(nu),
-            doubles(S), doubles(own_nu), doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),
+            doubles(read.R.packed(first)), logarithm, linear, int(keeping), doubles(nu),
+            doubles(S), doubles(own_nu), doubles(own_S), *(doubles(a) for a in arrays), doubles(steps), ctypes.byref(stop),
         )  # fmt: skip
         reached = min(reached, interruptible(lambda arguments=arguments: library.srf_filter(*arguments), stop))  # type: ignore[misc]
         count = min(LANES, k - first)
         nu_d[:, first : first + count], S_d[:, first : first + count] = own_nu[:, :count], own_S[:, :count]
     kept = SmootherInput(*arrays) if keep else None
-    return Innovations(nu, S, nu_d, S_d, reached, int(stats[0]), int(stats[2]), kept)
-
-
-def _bounds(model: GeneratedModel, p: Dual, farthest: float) -> Dual:
-    """Return by how much a reading may move each state (n,), without end but for logarithms and the field."""
-    if np.isinf(farthest):
-        return Dual.plain(np.full(len(model.states), np.inf), p.d.shape[-1])
-    amplitude = model.index("field_amplitude")
-    random = np.isin(model.states, ("field", "field_slope"))
-    unit = np.where(random, p.v[amplitude], [1.0 if s.startswith("ln_") else np.inf for s in model.states])
-    return Dual(farthest * unit, farthest * np.outer(random, p.d[amplitude]))
+    return Innovations(nu, S, nu_d, S_d, reached, int(steps[0]), kept)
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,6 @@ NEIGHBOUR_STEPS = (16, 64)  # of two standard errors to either side, least and m
 MAX_RIDGE_MOVES = 16
 MIN_EIGENVALUE = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 MIN_SENSITIVITY = 1e-6  # twice the log likelihood that a parameter changes between its bounds, below which its score is rounding
-MAX_UPDATE = 3.0  # by a reading of ln v and ln PHI, a factor of 20 in v and PHI; standard deviations of the field
 MAX_LOG_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
 # of a step: where its bend is taken; bends that are none; the largest that is followed
 ACCELERATION_STEP, MIN_ACCELERATION, MAX_ACCELERATION = 0.1, 0.1, 0.75
@@ -125,7 +124,7 @@ class Filtered:
         """Return innovations (n,), variances and derivatives of one signal, and what was kept where its readings are."""
         f, k, c = self.every, len(self.run.signals), slice(signal, None, len(self.run.signals))
         kept = f.kept and SmootherInput(*(x[c] for x in vars(f.kept).values()))
-        return Innovations(f.nu[c], f.S[c], f.nu_d[c], f.S_d[c], (f.reached + k - 1 - signal) // k, f.steps, f.bounded, kept)
+        return Innovations(f.nu[c], f.S[c], f.nu_d[c], f.S_d[c], (f.reached + k - 1 - signal) // k, f.steps, kept)
 
     @cached_property
     def found(self) -> Innovations:
@@ -253,7 +252,6 @@ def filter_run(
     rtol: float = FILTER_RTOL,
     keep: bool = False,
     most: int | None = None,
-    farthest: float = np.inf,
 ) -> Filtered:
     """Return `run` filtered under `values` (um, s, N), with derivatives by the parameters `by`.
 
@@ -261,8 +259,7 @@ def filter_run(
     gauge noise in the observable's unit, `gauge_colour1` of a coloured part with `gauge_time1` (s) if its correlation falls off
     exponentially or `gauge_frequency1` (Hz) and `gauge_quality1` if it is an oscillator's, and so on up to 3 of these, and what
     belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. `gauges` say by which names they have those of the gauge: for each
-    signal, one after the other, one for each of the run's sampling rates. After `most` steps it is given up. `farthest` is how
-    far a reading may move the state, as `kalman_filter` has it.
+    signal, one after the other, one for each of the run's sampling rates. After `most` steps it is given up.
     """
     k, c, rates = len(by), len(run.signals), len(run.sampling.spacings)
     p = run_parameters(model, experiment, run, values)
@@ -284,7 +281,7 @@ def filter_run(
         model, Dual(p, d), read, drive=run.drive, load=run.load, start=start, covariance=P0,
         gauge=Dual(gauge[0].reshape(rates, -1, 3), gauge[1].reshape(rates, c * len(rows), 3, k)),
         order=[len(row) - 1 for row in rows] * c, owner=np.repeat(np.arange(c), len(rows)).tolist(),
-        rtol=rtol, atol=rtol * size * fine, keep=keep, most=most, farthest=farthest,
+        rtol=rtol, atol=rtol * size * fine, keep=keep, most=most,
     )  # fmt: skip
     return Filtered(run, tuple(by), found)
 
@@ -381,11 +378,6 @@ class Point:
         """Return the root mean square of all standardised innovations and residuals: 1 under the right model."""
         white = np.concatenate([f.white for f in self.runs] + [t.white for t in self.tables])
         return float(np.sqrt(np.mean(white**2)))
-
-    @property
-    def surprising(self) -> int:
-        """Return how many readings would move the state farther than is linear; none where the model expects what it sees."""
-        return sum(f.every.bounded for f in self.runs)
 
 
 class Likelihood:
@@ -509,14 +501,10 @@ class Likelihood:
     ) -> Filtered:
         """Return one run filtered under values by name, with derivatives by the names that it depends on."""
         gauges, problem, by = self.gauges(run), self.problem, self._dependences(run)
-        for farthest in (np.inf, MAX_UPDATE):  # held back where it cannot be followed otherwise
-            found = filter_run(
-                problem.model, problem.experiment, run, problem.local(run, values), by=tuple(by.values()) if slopes else (),
-                gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
-                farthest=farthest,
-            )  # fmt: skip
-            if found.whole:
-                break
+        found = filter_run(
+            problem.model, problem.experiment, run, problem.local(run, values), by=tuple(by.values()) if slopes else (),
+            gauges=gauges, trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
+        )  # fmt: skip
         return replace(found, names=tuple(by) if slopes else ())
 
     def _dependences(self, run: Run) -> dict[str, str]:
@@ -1302,13 +1290,6 @@ class _FitProcedure:
                 if other.criterion > best.criterion:  # beside the colour there may be another, smaller field
                     best = self.beside_small_field(other)
                     best = best if best.smooth else self.with_or_without(best)
-        widest = wide.values(wide.start)["field_amplitude"]  # which may stand for colour, and for falls that come as a surprise
-        if fresh and processes is None and best.maximum.point.surprising and best.values["field_amplitude"] > widest:
-            coloured = self.likelihood(False, best.likelihood.processes or ("relaxation",))
-            another = maximise_from_starts(coloured, wide_starts(coloured, start, progress), steps, progress)
-            if another and another.expected > best.log_likelihood:
-                other = self.maximised(coloured, another.point.x)
-                best = max(best, self.with_or_without(other), key=lambda f: f.criterion)
         if fresh:
             best = likeliest_along_ridges(best, close, progress) if beside else best
         if fresh and smooth is None and best.smooth:
