@@ -201,6 +201,23 @@ def test_a_fall_that_comes_as_a_surprise_is_followed(make_model):
             assert np.abs(ours[:, j] - theirs / (2 * step)).max() < 1e-3 * np.abs(theirs / (2 * step)).max(), name
 
 
+@pytest.mark.parametrize("higher", [0.0, 3e-4])  # of the friction that was recorded
+def test_falls_within_a_sample_are_followed_under_any_field(make_model, higher):
+    """They come sooner or later than expected, by a reading a thousand of its own standard deviations off."""
+    choice = {"law": "dieterich-ruina", "ageing": "ruina", "interface": "rigid", "inertia": True}
+    drive, sd = Drive.steps([(0.0, 4.43), (1.0, 4.61)]), 0.027
+    run = recording(np.linspace(0, 9, 2251), "elongation", drive, ConstantLoad(0.651), stiffness=0.00201)
+    own = Rig(choice, {"mu0": 0.499, "A": 0.00716, "B": 0.01089, "D0": 0.0325}, run, "0.00201 N/um", 1.14e-9)
+    y = predict(make_model(**choice), own.experiment, run, own.values | {"mu0": own.values["mu0"] + higher}, rtol=1e-10).y
+    assert np.sum(np.diff(y) < -100 * sd) >= 3
+    run = replace(run, observed=y + sd * np.random.default_rng(1).standard_normal(y.size))
+    noise_alone = -y.size * (np.log(sd) + 0.5 * np.log(2 * np.pi) + 0.5)
+    for amplitude, length in ((1e-3, 0.3), (1e-3, 1.0), (1e-3, 5.0), (3e-4, 1.0)):
+        values = own.values | {"field_amplitude": amplitude, "field_length": length, "gauge_white": sd}
+        found = filter_run(make_model(**choice, random_field=True), own.experiment, run, values)
+        assert noise_alone - 250 < found.log_likelihood < noise_alone + 50, (amplitude, length)
+
+
 def test_a_field_that_vanishes_leaves_the_deterministic_likelihood_of_stick_slip(make_model):
     """Three falls of a few samples: what readings say of their times is not linear, and the truth stays the truth."""
     own, sd = MICRO, 0.01
