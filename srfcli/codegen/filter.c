@@ -715,8 +715,8 @@ static int gauss_newton(const Recording *run, int k, const Place *was, Place *at
     }
 }
 
-/* Where a shift of the states at the reading before leads that moves the least certain logarithm by so many standard deviations, and the others as
-   they go with it: the likeliest of a row of them, as `shift` (NX) and `by` (na). Returns 0 where none is likelier than `best`. */
+/* Of shifts of the states at the reading before, which move the least certain logarithm by standard deviations and the others as they
+   go with it, the likeliest, as `shift` (NX) and `by` (na). Returns 0 where none is likelier than `best`. */
 static int likelier_start(const Recording *run, int k, const Place *was, Place *at, Course *course, Belief *from, const Belief *b, const Expected *e, const Correction *best, dual *shift, double *by) {
     double kept[NX], far = 0.0, lowest = best->cost + best->off * best->off / best->variance;
     int along = 0, na = course->na;
@@ -737,7 +737,8 @@ static int likelier_start(const Recording *run, int k, const Place *was, Place *
         course->mean_only = 1;
         if (side && travel(run, at, course, from, run->t[k])) {
             for (int i = 0; i < NX; i++) y[i] = srf_plain(from->x[i]);
-            double off = run->observed[k] - rest - scale.v * shown(run, k, at, y, NULL).v, total = size * size + off * off / best->variance;
+            double off = run->observed[k] - rest - scale.v * shown(run, k, at, y, NULL).v;
+            double total = size * size + off * off / best->variance;
             if (total < lowest) {
                 lowest = total;
                 by[along] = size / sqrt(far);
