@@ -206,6 +206,9 @@ def test_choices_of_light_commands_are_those_of_what_they_import_late() -> None:
 
 def test_constants_in_the_docs_are_those_of_the_code() -> None:
     known = {name: value for path in files().values() for name, value in numbers(path)}
+    for path in PACKAGE.rglob("*.c"):
+        defined = re.findall(r"(?m)^#define ([A-Z][A-Z_]+) ([\d.e-]*\d)", path.read_text(encoding="utf-8"))
+        known |= {name: float(value) for name, value in defined}
     quoted = {
         (page.name, name, float(value))
         for page in (ROOT / "docs").rglob("*.md")
