@@ -90,7 +90,8 @@ class Fitted:
 
     `separate_field_evidence` is the log evidence where each run has a field of its own; of it `mass_at_bounds` comes from
     parameters at a bound. `shared` is what a field that all runs share gains beyond SIGNIFICANT_GAIN at first order, None where
-    an effect says what all runs share along slip; `shared_field_gain` is the gain that counts.
+    an effect says what all runs share along slip; `shared_field_gain` is the gain that counts. `evidence_bound` is what the model
+    has at most by what it extends.
     """
 
     hypothesis: Hypothesis
@@ -101,6 +102,7 @@ class Fitted:
     projection: ResidualProjection = field(repr=False)
     shared: float | None = None
     shared_field_gain: float = 0.0
+    evidence_bound: float = np.inf
     scores: Scores | None = field(default=None, repr=False)
 
     @property
@@ -110,8 +112,14 @@ class Fitted:
 
     @property
     def evidence(self) -> float:
-        """Return the log evidence, with what a field that all runs share is granted."""
-        return self.separate_field_evidence + self.shared_field_gain
+        """Return the log evidence, with what a field that all runs share is granted, within its bound."""
+        return min(self.separate_field_evidence + self.shared_field_gain, self.evidence_bound)
+
+    def extends(self, other: Fitted) -> bool:
+        """Return whether it is another fitted model with more effects, under the same kinds of field and gauge noise."""
+        own, its = self.fit.likelihood, other.fit.likelihood
+        nested = self.hypothesis.ageing == other.hypothesis.ageing and {*other.hypothesis.effects} < {*self.hypothesis.effects}
+        return nested and own.smooth == its.smooth and own.processes == its.processes and {*its.names} < {*own.names}
 
     @property
     def passes(self) -> bool:
@@ -1074,6 +1082,21 @@ class ModelSearch:
             self.fitted.update(
                 {name: replace(f, shared_field_gain=gain) for name, f in under.items() if f.shared_field_gain != gain}
             )
+        self._bound_evidence()
+
+    def _bound_evidence(self) -> None:
+        """Bound the log evidence of each model by that of what it extends and the gain in log likelihood.
+
+        By Laplace's method it may be higher where the likelihood has kinks, as beside falls: its curvature is not that of a
+        normal distribution.
+        """
+        for f in sorted(self.fitted.values(), key=lambda f: len(f.hypothesis.effects)):
+            within = [
+                other.attainable - self._prior(other.hypothesis) + f.fit.log_likelihood - other.fit.log_likelihood
+                for other in self.fitted.values()
+                if f.extends(other)
+            ]
+            self.fitted[f.name] = replace(f, evidence_bound=self._prior(f.hypothesis) + min(within, default=np.inf))
 
     def ranked(self) -> list[Fitted]:
         """Return everything that was fitted, best evidence first."""
