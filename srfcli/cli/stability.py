@@ -138,10 +138,10 @@ def response(
     slider = system.slider(V=V, W0=W0)
     swept = {r.name: r.fitted(slider.model.parameters, where=slider.model.title).points() for r in over}
     options.check_axes(swept, {"V": V, "W0": W0})
-    system.say_defaults(slider.resolved, {"V", "W0"} - swept.keys())
     tolerance = system.tolerance(tol).value
     with Progress("response") as progress:
         found = stability.response(slider, over=swept, eps=eps or None, tol=tolerance)
+    system.say_defaults(slider.resolved, {"V", "W0"} - swept.keys())
     emit(found.table, output, laws=slider.model.laws, timings={"solve": progress.seconds}, figure=found.plot)
     finish(found.status)
 
