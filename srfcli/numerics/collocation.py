@@ -329,11 +329,19 @@ def log_determinant(condensed: Condensed, orbit: Discretisation) -> float:
 
 
 def running_products(maps: Array) -> Array:
-    """Return I, A_0, A_1 A_0, ... of `maps` (..., N, k, k) as (..., N+1, k, k)."""
+    """Return I, A_0, A_1 A_0, ... of `maps` (..., N, k, k) as (..., N+1, k, k), by blocks of about sqrt(N)."""
     N, k = maps.shape[-3], maps.shape[-1]
     out = np.empty((*maps.shape[:-3], N + 1, k, k), dtype=maps.dtype)
     out[..., 0, :, :] = np.eye(k)
-    for i in range(N):
+    width = int(np.ceil(np.sqrt(N)))
+    blocks = N // width
+    inner = maps[..., : blocks * width, :, :].reshape(*maps.shape[:-3], blocks, width, k, k).copy()
+    for j in range(1, width):
+        inner[..., j, :, :] = inner[..., j, :, :] @ inner[..., j - 1, :, :]
+    for b in range(blocks):
+        start = out[..., b * width, None, :, :]
+        out[..., b * width + 1 : (b + 1) * width + 1, :, :] = inner[..., b, :, :, :] @ start
+    for i in range(blocks * width, N):
         out[..., i + 1, :, :] = maps[..., i, :, :] @ out[..., i, :, :]
     return out
 
